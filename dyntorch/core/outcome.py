@@ -120,14 +120,15 @@ class Notice:
 
 
 def notices(code: NoticeCode, values: Tensor, flagged: Tensor, batch: tuple[int, ...], **more: Any) -> list[Notice]:
-    """A notice for every flagged problem. values ``(b,)``, flagged ``(b,)``."""
+    """A notice for every flagged problem. values ``(b,)``, flagged ``(b,)``; what ``more`` it speaks of may be ``(b,)``, too."""
     # one copy: an accelerator would wait for every number
     figures = torch.where(flagged, values.detach().double(), torch.nan), flagged.double()
     collected = []
     for flat, (value, counts) in enumerate(zip(*torch.stack(figures).tolist(), strict=True)):
         if counts:
             place = tuple(int(i) for i in np.unravel_index(flat, batch)) if batch else ()
-            collected.append(Notice(code, value, more, place))
+            own = {name: one[flat].item() if isinstance(one, Tensor) else one for name, one in more.items()}
+            collected.append(Notice(code, value, own, place))
     return collected
 
 

@@ -25,7 +25,17 @@ from dyntorch.invariants.homography_tensor import HomographyTensor
 from dyntorch.invariants.join_tensor import JoinTensor
 from dyntorch.numerics.blocks import each, map_blocks, select, uniform
 from dyntorch.numerics.nullspace import null_space, spectrum
-from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, agrees_too_little, labels_of, status_of_alignment
+from dyntorch.tasks.align.result import (
+    MIN_STATIC_SUPPORT,
+    MOVING,
+    OUTLIER,
+    STATIC,
+    agrees_too_little,
+    contradicts,
+    count_rival_static,
+    labels_of,
+    status_of_alignment,
+)
 
 NUM_LABEL_ROUNDS = 3  # of labelling and refining with the noise known
 NUM_LABEL_ROUNDS_UNKNOWN_NOISE = 6  # turns with the noise to be found as well
@@ -38,6 +48,8 @@ MAX_START_STEPS = 30  # of the refinement that takes all matches for moving inli
 NUM_LABEL_STEPS = 6  # of Levenberg-Marquardt between two labellings
 MIN_SINGULAR_RATIO = 1e-3  # of a collineation in normalized coordinates; usually above .1
 NUM_SCORED_MATCHES = 256  # that judge a hypothesis: enough to tell 5 % of agreement from none
+STATIC_SUPPORT_FACTOR = 3.0  # static matches for each that is expected by chance, besides
+CHANCE_LIMIT_FACTOR = 3.0  # times the limit of static matches within which those that are static by chance spread evenly
 
 
 @dataclass(frozen=True)
@@ -82,15 +94,18 @@ class Evidence:
 
     def repeat(self, count: int) -> Evidence:
         """The same problems several times, one block after the other."""
+        return self._select(lambda x: x.repeat(count, *([1] * (x.ndim - 1))))
 
-        def tile(x: Tensor) -> Tensor:
-            return x.repeat(count, *([1] * (x.ndim - 1)))
+    def subset(self, keep: Tensor) -> Evidence:
+        """Some of the problems, ``(b,)`` bool."""
+        return self._select(lambda x: x[keep])
 
-        views, weights, static = each(tile, (self.data.views, self.data.weights, self.data.static))
+    def _select(self, take: Callable[[Tensor], Tensor]) -> Evidence:
+        views, weights, static = each(take, (self.data.views, self.data.weights, self.data.static))
         data = replace(self.data, views=views, weights=weights, static=static, batch=weights.shape[:1])
-        transforms, actions = each(tile, (self.norm.transforms, self.norm.actions))
+        transforms, actions = each(take, (self.norm.transforms, self.norm.actions))
         norm = Normalization(transforms, self.norm.primitives, actions)
-        return Evidence(self.invariant, data, norm, each(tile, self.views), tile(self.floor))
+        return Evidence(self.invariant, data, norm, each(take, self.views), take(self.floor))
 
     def given_noise(self, threshold: float | None) -> Tensor | None:
         """Standard deviation ``(b,)`` that a threshold stands for."""
@@ -116,8 +131,13 @@ class Evidence:
         other = still + (moving.square().sum(-1) / variance).clamp(max=path)
         if self.data.static is not None:
             other = torch.where(self.data.static, still + path, other)
-        cost = torch.minimum(resting.square().sum(-1) / variance, other)
-        return (self.data.weights * cost.nan_to_num(nan=still + path)).sum(-1)
+        cost = torch.minimum(resting.square().sum(-1) / variance, other).nan_to_num(nan=still + path)
+        total = (self.data.weights * cost).sum(-1)
+        if self.data.static is None:
+            return total
+        # a motion against most of what is known to stand still is worse than any other
+        against = contradicts(cost < still + path, self.data.static, self.data.weights)
+        return total + against * (still + path) * self.data.weights.sum(-1)
 
     def labels(self, theta: Tensor, sigma: Tensor, spread: Tensor | None = None) -> Tensor:
         """``(b, n)``; ``spread (b, p, p)`` is the covariance of theta for noise 1, which widens the limits."""
@@ -239,6 +259,35 @@ def tensor_start(
             # what its inliers show is less than the median, where there are many outliers
             noise = torch.where((found.status == Status.OK) & (found.sigma > 0), torch.minimum(found.sigma, noise), noise)
     return theta, given if given is not None else torch.where(usable & noise.isfinite(), noise, torch.inf)
+
+
+def has_static_support(evidence: Evidence, found: Labelled) -> Tensor:
+    """Where more matches are static ``(b,)`` than some motion of a family makes by chance."""
+    still = (found.labels == STATIC) & (evidence.data.weights > 0)
+    square = evidence.residuals(found.theta)[1].square().sum(-1)
+    limit = CHANCE_LIMIT_FACTOR**2 * three_sigma(evidence.static_conditions) * found.sigma.square()[:, None]
+    beside = ((square <= limit) & ~still & (evidence.data.weights > 0)).sum(-1)
+    return still.sum(-1) >= MIN_STATIC_SUPPORT + STATIC_SUPPORT_FACTOR * beside / (CHANCE_LIMIT_FACTOR**2 - 1)
+
+
+def other_background(
+    evidence: Evidence, best: Labelled, asked: Tensor, samples: int, min_share: float, generator: torch.Generator | None
+) -> Tensor:
+    """Matches ``(b,)`` that stand still by a rival motion and move by this one, 0 where none explains the matches as well: a convoy
+    and what it passes are each other's background.  ``asked (b,)`` problems are searched."""
+    moving = best.labels == MOVING
+    asked = asked & (moving.sum(-1) >= MIN_STATIC_SUPPORT)
+    count = torch.zeros_like(moving[:, 0], dtype=torch.long)
+    if not bool(asked.any()):
+        return count
+    evidence, sigma, labels, moving = evidence.subset(asked), best.sigma[asked], best.labels[asked], moving[asked]
+    movers = replace(evidence, data=replace(evidence.data, weights=evidence.data.weights * moving, static=None))
+    theta, _ = static_start(movers, sigma, samples, generator)
+    # labels of a minimal sample, then those of all matches
+    theta = movers.improve(theta, sigma, torch.ones_like(sigma, dtype=torch.bool))
+    rival = evidence.iterate_labels(theta, sigma, estimate=False)
+    still = count_rival_static(labels, rival.labels, evidence.data, min_share) * has_static_support(evidence, rival)
+    return count.masked_scatter(asked, still)
 
 
 def status_of_labels(

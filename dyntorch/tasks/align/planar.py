@@ -28,8 +28,10 @@ from dyntorch.numerics.nullspace import eigenvalues
 from dyntorch.tasks.align.labelling import (
     Evidence,
     Labelled,
+    has_static_support,
     moving_points,
     normalized_motion,
+    other_background,
     static_start,
     status_of_labels,
     tensor_start,
@@ -213,9 +215,6 @@ PLANAR_RANK_TOLERANCE = 1e-9  # singular value over the largest that rounding al
 # of the weakest equation; .4 to .7 where all is static, 1.3 to 1.6 at 1 to 5 px of motion and .5 px noise
 MIN_TENSOR_STRENGTH = 2.0
 MIN_DETERMINED_STRENGTH = 1.2  # corrected for 26 equations: .7 to .9 where all make equal steps, .5 where all is static
-MIN_STATIC_SUPPORT = 10  # static matches that decide such a family; a wrong motion makes 0 to 6 of 80 matches static
-STATIC_SUPPORT_FACTOR = 3.0  # static matches for each that is expected by chance, besides
-CHANCE_LIMIT_FACTOR = 3.0  # times the limit of static matches within which those that are static by chance spread evenly
 MIN_LINE_WIDTH = 3.0  # standard deviations of the noise across a line of points, below which they may as well lie on it
 NUM_PLANAR_SAMPLES = 1000  # of four: 96 % to draw four static ones where they are 24 % of all
 MAX_PLANAR_STEPS = 30  # of the final refinement
@@ -226,10 +225,11 @@ MIN_SPARE_PLANAR = 8  # conditions beyond the 16 degrees of freedom that inliers
 
 
 def planar_notices(
-    evidence: Evidence, best: Labelled, tensor: tuple[Tensor, Tensor], unverified: Tensor, status: Tensor, batch: tuple[int, ...]
-) -> tuple[Notice, ...]:
+    evidence: Evidence, best: Labelled, tensor: tuple[Tensor, Tensor], unverified: Tensor, rival: Tensor, status: Tensor,
+    batch: tuple[int, ...],
+) -> tuple[Notice, ...]:  # fmt: skip
     """All notices on a flat batch of problems with final labels, in the order of the problems; ``tensor`` from
-    :func:`tensor_rank`, moving matches ``unverified (b, n)``."""
+    :func:`tensor_rank`, moving matches ``unverified (b, n)``, ``rival (b,)`` from :func:`other_background`."""
     data = evidence.data
     rank, strength = tensor
     solved = ~is_failure(status)
@@ -238,8 +238,9 @@ def planar_notices(
     full = HomographyTensor.width() - 1
     note(AlignNotice.DEGENERATE, rank, solved & (rank < full))
     note(AlignNotice.NEAR_STATIC, strength, solved & (rank >= full) & (strength < MIN_TENSOR_STRENGTH), case="tensor")
-    family = (status == Status.AMBIGUOUS) & is_undecided(evidence, best, tensor)
-    note(AlignNotice.OTHER_SOLUTION, (best.labels == STATIC).sum(-1), family)
+    family, still = (status == Status.AMBIGUOUS) & is_undecided(evidence, best, tensor), (best.labels == STATIC).sum(-1)
+    note(AlignNotice.OTHER_SOLUTION, still, family)
+    note(AlignNotice.OTHER_BACKGROUND, rival, rival > 0, still=still)
     note(AlignNotice.FEW_MOVING, count, solved & (count < FEWEST), least=f"{FEWEST}")
     lines = trajectory_lines(evidence, best, LINES)
     note(AlignNotice.FEW_LINES, lines, solved & (lines > 0) & (lines < LINES), least=LINES)
@@ -270,13 +271,10 @@ def is_undecided(evidence: Evidence, best: Labelled, tensor: tuple[Tensor, Tenso
     equations = HomographyTensor.width() - 1
     spare = ((used - equations).clamp(min=1) / used.clamp(min=1)).sqrt()
     family = (rank >= equations) & (strength < MIN_DETERMINED_STRENGTH * spare)
-    still = (best.labels == STATIC) & (evidence.data.weights > 0)
     if evidence.data.static is not None:
+        still = (best.labels == STATIC) & (evidence.data.weights > 0)
         family = family & ((still & evidence.data.static).sum(-1) < NOTICES_MINIMAL)
-    square = evidence.residuals(best.theta)[1].square().sum(-1)
-    limit = CHANCE_LIMIT_FACTOR**2 * three_sigma(evidence.static_conditions) * best.sigma.square()[:, None]
-    beside = ((square <= limit) & ~still & (evidence.data.weights > 0)).sum(-1)
-    return family & (still.sum(-1) < MIN_STATIC_SUPPORT + STATIC_SUPPORT_FACTOR * beside / (CHANCE_LIMIT_FACTOR**2 - 1))
+    return family & ~has_static_support(evidence, best)
 
 
 def unverified_matches(evidence: Evidence, best: Labelled) -> Tensor:
@@ -411,9 +409,9 @@ def _align(
     data: Matches, threshold: float | None, K: Tensor | None, generator: torch.Generator | None, options: AlignOptions
 ) -> Alignment:
     evidence = Evidence.of(moving_points(2, len(data.views)), data)
-    solution, best, tensor = _solve(evidence, _search(evidence, threshold, generator, options))
+    solution, best, tensor, rival = _solve(evidence, _search(evidence, threshold, generator, options), generator, options)
     unverified = unverified_matches(evidence, best) & (best.labels == MOVING)
-    notices = planar_notices(evidence, best, tensor, unverified, solution.status, data.batch)
+    notices = planar_notices(evidence, best, tensor, unverified, rival, solution.status, data.batch)
     calibrated: dict[str, Any] = {}
     if K is not None:
         turned, other, told = euclidean(solution, data, best.labels, K)
@@ -436,8 +434,11 @@ def _search(evidence: Evidence, threshold: float | None, generator: torch.Genera
     return evidence.iterate_labels(evidence.best_start(theta, sigma), sigma, estimate=given is None)
 
 
-def _solve(evidence: Evidence, best: Labelled) -> tuple[Solution, Labelled, tuple[Tensor, Tensor]]:
-    """The solution with its status, the final labels, none where there is no motion, and what the tensor alone rests on."""
+def _solve(
+    evidence: Evidence, best: Labelled, generator: torch.Generator | None, options: AlignOptions
+) -> tuple[Solution, Labelled, tuple[Tensor, Tensor], Tensor]:
+    """The solution with its status, the final labels, none where there is no motion, what the tensor alone rests on, and how many
+    matches stand still by a rival motion."""
     refined = evidence.refine(best.theta, best.labels, MAX_PLANAR_STEPS)
     theta = normalized_motion(refined)
     values, spread = evidence.information(theta, best.labels)
@@ -451,5 +452,9 @@ def _solve(evidence: Evidence, best: Labelled) -> tuple[Solution, Labelled, tupl
     odd = (share < MIN_NOISY_INLIER_SHARE) & (refined.sigma > MAX_NOISE_RATIO * best.sigma)
     undetermined = values[:, 0] <= MIN_INFORMATION * values[:, -1]
     status = status_of_labels(evidence, best, free, undetermined, odd, MIN_SPARE_PLANAR, (MINIMAL, 4))
+    # where the equations leave one tensor, there is no rival
+    asked = (status == Status.OK) & (tensor[1] < MIN_TENSOR_STRENGTH)
+    rival = other_background(evidence, best, asked, options.num_samples or NUM_PLANAR_SAMPLES, options.min_static_share, generator)
+    status = torch.where(rival > 0, int(Status.AMBIGUOUS), status)
     solution, labels = without_failures(refined, status, labels, worst)
-    return solution, replace(best, labels=labels), tensor
+    return solution, replace(best, labels=labels), tensor, rival

@@ -11,7 +11,7 @@ from torch import Tensor
 from dyntorch.core.invariant import Invariant
 from dyntorch.core.limits import MIN_INFORMATION
 from dyntorch.core.matches import Matches, matches
-from dyntorch.core.outcome import Notice, in_order, is_failure, noting
+from dyntorch.core.outcome import Notice, Status, in_order, is_failure, noting
 from dyntorch.core.solution import Solution
 from dyntorch.invariants.join_tensor import JoinTensor
 from dyntorch.invariants.minimal_join_tensor import MinimalJoinTensor
@@ -24,6 +24,7 @@ from dyntorch.tasks.align.labelling import (
     Labelled,
     moving_points,
     normalized_motion,
+    other_background,
     static_start,
     status_of_labels,
     tensor_start,
@@ -63,9 +64,9 @@ def align_join(
     """:func:`dyntorch.align_points` with a join tensor, for checked matches."""
     evidence = Evidence.of(moving_points(3, len(data.views)), data)
     best = _search(evidence, threshold, model, generator, options)
-    solution, labels, worst = _solve(evidence, best)
-    notices = _notices(evidence, replace(best, labels=labels), worst, solution.status, data.batch, options)
-    return solved_alignment(solution, data, labels, AMBIGUITY, notices)
+    solution, best, worst, rival = _solve(evidence, best, generator, options)
+    notices = _notices(evidence, best, worst, rival, solution.status, data.batch, options)
+    return solved_alignment(solution, data, best.labels, AMBIGUITY, notices)
 
 
 def _search(
@@ -105,25 +106,34 @@ def _doubt(evidence: Evidence, theta: Tensor, sigma: Tensor) -> Tensor:
     return ((2 * agreeing <= present) | (moving * invariant.codim <= invariant.dof)).to(theta)
 
 
-def _solve(evidence: Evidence, best: Labelled) -> tuple[Solution, Tensor, Tensor]:
-    """The solution with its status, the final labels (none where there is no motion), and the worst standard deviation."""
+def _solve(
+    evidence: Evidence, best: Labelled, generator: torch.Generator | None, options: AlignOptions
+) -> tuple[Solution, Labelled, Tensor, Tensor]:
+    """The solution with its status, the final labels (none where there is no motion), the worst standard deviation, and how many
+    matches stand still by a rival motion."""
     refined = evidence.refine(best.theta, best.labels, MAX_JOIN_STEPS)
     theta = normalized_motion(refined)
     values, spread = evidence.information(theta, best.labels)
     labels = evidence.labels(theta, best.sigma, spread)
     worst = best.sigma * values[:, 0].clamp(min=torch.finfo(values.dtype).tiny).rsqrt() * torch.stack(evidence.norm.scales).amax(0)
-    best = replace(best, labels=labels)
+    best = Labelled(theta, labels, best.sigma)
     undetermined = values[:, 0] <= MIN_INFORMATION * values[:, -1]
     status = status_of_labels(evidence, best, worst > MAX_JOIN_DEVIATION, undetermined, False, MIN_SPARE_JOIN, (MIN_JOIN, ENOUGH))
-    return *without_failures(refined, status, labels, worst), worst
+    rival = other_background(
+        evidence, best, status == Status.OK, options.num_samples or NUM_JOIN_SAMPLES, options.min_static_share, generator
+    )
+    status = torch.where(rival > 0, int(Status.AMBIGUOUS), status)
+    solution, labels = without_failures(refined, status, labels, worst)
+    return solution, replace(best, labels=labels), worst, rival
 
 
 def _notices(
-    evidence: Evidence, best: Labelled, worst: Tensor, status: Tensor, batch: tuple[int, ...], options: AlignOptions
+    evidence: Evidence, best: Labelled, worst: Tensor, rival: Tensor, status: Tensor, batch: tuple[int, ...], options: AlignOptions
 ) -> tuple[Notice, ...]:
     solved = ~is_failure(status)
     moving, still = (best.labels == MOVING).sum(-1), (best.labels == STATIC).sum(-1)
     found, note = noting(batch)
+    note(AlignNotice.OTHER_BACKGROUND, rival, rival > 0, still=still)
     note(AlignNotice.FEW_MOVING, moving, solved & (moving < MIN_MOVERS) & (still < ENOUGH), least=f"{MIN_MOVERS} and more")
     note(AlignNotice.NEAR_STATIC, moving, solved & (moving < MIN_LINES) & (still >= ENOUGH), case="matches")
     lines = trajectory_lines(evidence, best, MIN_LINES)

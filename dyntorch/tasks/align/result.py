@@ -86,6 +86,13 @@ class AlignNotice(NoticeCode):
         "more static matches",
     )
     """Another solution fits as well."""
+    OTHER_BACKGROUND = (
+        "other_background",
+        "either {still:# match stands|# matches stand} still, as the labels say, or {value:# other one does|# others do}, which "
+        "move alike: the views fit both; label static ones ({arg:static=}), add a view behind a change of their course, or raise "
+        "{arg:options.min_static_share} over the share that may stand still and does not",
+    )
+    """Matches that move alike may as well be what stands still, and what stands still move."""
     UNCERTAIN = (
         "uncertain",
         {
@@ -236,6 +243,28 @@ def agrees_too_little(labels: Tensor, weights: Tensor, conditions: tuple[int, in
     return (still + moving < MIN_CONSENSUS * (weights > 0).sum(-1)) | (fulfilled < least)
 
 
+def contradicts(rests: Tensor, known: Tensor, weights: Tensor) -> Tensor:
+    """Whether fewer than half of the matches known to be static ``(..., n)`` rest by a motion ``(...)``."""
+    known = known & (weights > 0)
+    return 2 * (rests & known).sum(-1) < known.sum(-1)
+
+
+MIN_STATIC_SUPPORT = 10  # static matches that decide among motions; a wrong motion makes 0 to 6 of 80 matches static
+MIN_RIVAL_SHARE = 0.9  # of the matches explained that a rival explains as well
+
+
+def count_rival_static(labels: Tensor, rival: Tensor, data: Matches, min_share: float) -> Tensor:
+    """Matches ``(b,)`` that move by some labels and stand still by those of a rival motion; 0 where it explains fewer, or too few
+    stand still to be the background, or fewer of those that are known to."""
+    explained, still = (labels != OUTLIER).sum(-1), ((rival == STATIC) & (labels == MOVING)).sum(-1)
+    fits = (rival != OUTLIER).sum(-1) >= MIN_RIVAL_SHARE * explained
+    fits = fits & (still >= min_share * explained) & (still >= MIN_STATIC_SUPPORT)
+    if data.static is not None:
+        known = data.static & (data.weights > 0)
+        fits = fits & ((known & (rival == STATIC)).sum(-1) >= (known & (labels == STATIC)).sum(-1))
+    return torch.where(fits, still, 0)
+
+
 def status_of_alignment(ambiguous: Tensor, accident: Tensor, undetermined: Tensor, few: Tensor) -> Tensor:
     """The gravest status ``(b,)`` of: the noise leaves other motions, too little agrees, several fit exactly, too few matches."""
     status = torch.where(ambiguous, int(Status.AMBIGUOUS), int(Status.OK))
@@ -303,7 +332,7 @@ class AlignOptions:
     """Minimal samples drawn (time); None is what each model needs at 20 to 40 % of static matches: 150 to 2000.  Rigid and
     projective constant-velocity motions have fixed numbers of their own."""
     min_static_share: float = 0.1
-    """Share of the matches (and at least 3) that must have one velocity to be taken for the static background, where all are at
-    constant velocity."""
+    """Least share of the matches (and at least 3) that may be the static background: of one velocity, where all are at constant
+    velocity; elsewhere a smaller group that moves alike leaves the answer without doubt."""
     max_deviation: float = 0.05
     """Standard deviation of the worst direction of a motion of norm 1 (rigid: radians, or sizes of the scene) without a notice."""

@@ -11,15 +11,16 @@ from torch.nn.functional import normalize, pad
 
 from dyntorch.core.limits import median, three_sigma
 from dyntorch.core.matches import Matches
-from dyntorch.core.outcome import Notice, in_order, is_failure, noting
+from dyntorch.core.outcome import Notice, Status, in_order, is_failure, noting
 from dyntorch.core.solution import NOISY
 from dyntorch.geometry.homogeneous import similarity, skew
 from dyntorch.geometry.rigid import moved_by, rigid_alignment
 from dyntorch.numerics.blocks import each, map_blocks, uniform
 from dyntorch.numerics.least_squares import Iterate, LeastSquares, LeastSquaresOptions, Tensors, damped_step, minimize
 from dyntorch.numerics.nullspace import spectrum
-from dyntorch.tasks.align.labelling import THRESHOLD_SIGMAS
+from dyntorch.tasks.align.labelling import ROUGH_LABEL_FACTOR, THRESHOLD_SIGMAS
 from dyntorch.tasks.align.result import (
+    MIN_STATIC_SUPPORT,
     MOVING,
     OUTLIER,
     STATIC,
@@ -28,6 +29,9 @@ from dyntorch.tasks.align.result import (
     AlignOptions,
     agrees_too_little,
     alignment_of,
+    contradicts,
+    count_rival_static,
+    labels_of,
     status_of_alignment,
 )
 
@@ -257,11 +261,13 @@ def _search(
     motions = candidates.gather(1, chosen[..., None, None, None].expand(-1, -1, 2, 4, 4))
     noise = noise.gather(1, chosen)
     noise = noise if sigma is not None else noise.amin(1, keepdim=True).expand_as(noise)
+    resting = _descend_static(motions, noise, data)
     for stretch in (8.0, 3.0, 1.0):
         motions, _ = descend(motions, data, scale=noise * stretch * three_sigma(data.conditions) ** 0.5, iterations=12)
         noise = noise if sigma is not None else _scales(squares(motions, data)[0], data, floor)
     # one noise for all, or the worse motion would be forgiven more
     noise = noise if sigma is not None else noise.amin(1, keepdim=True).expand_as(noise)
+    motions, noise = torch.cat([motions, resting], dim=1), noise.repeat(1, 2)
     winner = _score(*squares(motions, data), held, data, noise).argmin(1)
     first = torch.arange(len(winner), device=winner.device)
     flat = each(lambda x: x[:, 0], data)
@@ -282,6 +288,12 @@ def _search(
 def static_motions(data: RigidSightings, weights: Tensor) -> Tensor:
     """The motions ``(..., 2, 4, 4)`` that carry matches onto each other, as if none moved."""
     return torch.stack([rigid_alignment(data.x1, x, weights) for x in (data.x2, data.x3)], dim=-3)
+
+
+def _descend_static(motions: Tensor, noise: Tensor, data: RigidSightings) -> Tensor:
+    """Motions ``(b, k, 2, 4, 4)`` refined by what nearly stands still: as movers these would follow others along their lines."""
+    still = squares(motions, data)[1] <= (ROUGH_LABEL_FACTOR * noise[..., None]).square() * three_sigma(6)
+    return descend(motions, replace(data, weights=data.weights * still), still=still, iterations=12)[0]
 
 
 def _samples(data: RigidSightings, order: Tensor) -> tuple[Tensor, Tensor]:
@@ -306,7 +318,9 @@ def _score(moving: Tensor, static: Tensor, held: Tensor, data: RigidSightings, s
     # the common velocity is still open in the other model, so that nothing stands still yet
     resting = static / square if data.motion == "straight" else torch.full_like(cost, torch.inf)
     cost = torch.where(held[:, None], (static / square).clamp(max=BITS * 6), torch.minimum(cost, resting))
-    return (cost * (data.weights > 0)).sum(-1)
+    # a motion against most of what is known to stand still is worse than any other
+    against = contradicts(static / square < BITS * 6, held[:, None], data.weights)
+    return ((cost + BITS * 6 * against[..., None]) * (data.weights > 0)).sum(-1)
 
 
 def _iterate_labels(
@@ -391,7 +405,26 @@ def align_rigid(
     none = x1.new_zeros(len(x1), 0, 2, 4, 4)
     starts = none if data.static is None else _from_static(sightings, data.static & (weights > 0))
     found = search(sightings, sigma, data.static, starts, generator, floor=100 * torch.finfo(data.dtype).eps, options=options)
-    return _result(data, sightings, found, centres, scale, options)
+    rival = _other_background(data, sightings, found, generator, options)
+    return _result(data, sightings, found, rival, centres, scale, options)
+
+
+def _other_background(
+    data: Matches, sightings: RigidSightings, found: Rigid, generator: torch.Generator | None, options: AlignOptions
+) -> Tensor:
+    """Matches ``(b,)`` that move, and stand still by a rival motion that explains the matches as well; 0 where there is none."""
+    labels = _labels(sightings, found)
+    moving = (labels == MOVING) & ((labels == MOVING).sum(-1) >= MIN_STATIC_SUPPORT)[:, None]
+    if not bool(moving.any()):
+        return torch.zeros_like(moving[:, 0], dtype=torch.long)
+    movers = replace(sightings, weights=sightings.weights * moving)
+    none = found.motions.new_zeros(len(moving), 0, 2, 4, 4)
+    # as if the movers were known to stand still: those that do so by one motion
+    rival = search(movers, found.sigma, moving, none, generator, options=options)
+    path, still = squares(rival.motions, sightings)
+    square = found.sigma.square()[:, None]
+    rests, moves = still <= three_sigma(6) * square, path <= three_sigma(sightings.conditions) * square
+    return count_rival_static(labels, labels_of(rests, moves, data), data, options.min_static_share)
 
 
 def _frame(views: tuple[Tensor, ...], weights: Tensor) -> tuple[list[Tensor], Tensor]:
@@ -408,7 +441,13 @@ def _from_static(data: RigidSightings, known: Tensor) -> Tensor:
 
 
 def _result(
-    data: Matches, sightings: RigidSightings, found: Rigid, centres: list[Tensor], scale: Tensor, options: AlignOptions
+    data: Matches,
+    sightings: RigidSightings,
+    found: Rigid,
+    rival: Tensor,
+    centres: list[Tensor],
+    scale: Tensor,
+    options: AlignOptions,
 ) -> Alignment:
     motion = sightings.motion
     labels = _labels(sightings, found)
@@ -420,6 +459,8 @@ def _result(
     accident = noisy | agrees_too_little(labels, sightings.weights, (6, MOTIONS[motion]), dof + MIN_SPARE_RIGID)
     undetermined, few = (values <= RIGID_INFORMATION_RATIO * top) & ~accident, (sightings.weights > 0).sum(-1) < 3
     status = status_of_alignment(worst > MAX_RIGID_DEVIATION, accident, undetermined, few)
+    rival = torch.where(status == Status.OK, rival, 0)
+    status = torch.where(rival > 0, int(Status.AMBIGUOUS), status)
     none = is_failure(status)
     labels = torch.where(none[:, None], OUTLIER, labels)
     matrices, entries = _to_point_units(found.motions, root * found.sigma[:, None, None], centres, scale)
@@ -438,7 +479,7 @@ def _result(
         found.sigma / scale,
         entries,
         ambiguity=AMBIGUITY[motion],
-        notices=_notices(labels, worst, found.grounded, none, motion, data.batch, options),
+        notices=_notices(labels, worst, found.grounded, rival, none, motion, data.batch, options),
         velocities=velocities,
     )
 
@@ -477,10 +518,12 @@ def _to_point_units(motions: Tensor, root: Tensor, centres: list[Tensor], scale:
 
 
 def _notices(
-    labels: Tensor, worst: Tensor, grounded: Tensor, none: Tensor, motion: str, batch: tuple[int, ...], options: AlignOptions
-) -> tuple[Notice, ...]:
+    labels: Tensor, worst: Tensor, grounded: Tensor, rival: Tensor, none: Tensor, motion: str, batch: tuple[int, ...],
+    options: AlignOptions,
+) -> tuple[Notice, ...]:  # fmt: skip
     moving, solved = (labels == MOVING).sum(-1), ~none
     found, note = noting(batch)
+    note(AlignNotice.OTHER_BACKGROUND, rival, rival > 0, still=(labels == STATIC).sum(-1))
     note(AlignNotice.UNCERTAIN, worst, solved & (worst > options.max_deviation), case="rigid")
     note(AlignNotice.COMMON_VELOCITY, worst, solved & ~grounded)
     few = solved & (moving < MINIMAL[motion]) & ((labels == STATIC).sum(-1) < 3)

@@ -13,8 +13,8 @@ there is no dominant plane, and the result is wrong.  The share experiment takes
 background points away, down to none; the error is measured on all of them.  Beside it, RANSAC homographies (kornia), for
 which cars are outliers.  Neither method survives 10 %: a car is a rigid body with a homography of its own, and the largest
 of those that stand still among themselves is taken for the background.  The tensor needs no static points, but points that
-move in different ways, and two cars do not.  The status stays OK there: three views cannot tell a car that stands still
-from a road that does.
+move in different ways, and two cars do not.  Three views cannot tell a car that stands still from a road that does: where
+the rest drives straight before it, the status is ``AMBIGUOUS``, whichever of the two is chosen (notice ``other_background``).
 
 **Board** (caliscope): a board with 12 corners of known identity, moved by hand; at three instants it is a plane in three
 unknown poses.  Corners that keep their identity stand still on it.  A point that *moves* on it is made of true sightings:

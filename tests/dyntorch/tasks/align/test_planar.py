@@ -9,7 +9,7 @@ from dyntorch.core.outcome import Notice, Status
 from dyntorch.metrics import grid_transfer_error, label_scores
 from dyntorch.tasks.align.planar import align_planar
 from dyntorch.tasks.align.result import AlignNotice
-from tests.battery.steps import equal_steps
+from tests.battery.steps import convoy, equal_steps
 
 
 def generator(seed=0):
@@ -271,3 +271,30 @@ def test_static_points_choose_among_the_cameras_that_equal_steps_leave():
     result = align_planar(*equal_steps(60, still=0.4, generator=draw), generator=draw)
     assert result.status == Status.OK and (result.labels[:24] == 1).double().mean() > 0.9
     torch.testing.assert_close(result.A / result.A[2, 2], torch.eye(3, dtype=torch.float64), atol=2.0, rtol=0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("still", [15, 25, 40])
+def test_a_convoy_and_what_it_passes_are_each_others_background(still):
+    draw = generator(still)
+    views = convoy(10, 70, still=still, step=(18.0, 9.0), sigma=0.5, size=640.0, generator=draw)
+    result = align_planar(*views, generator=draw)
+    assert (result.status == Status.AMBIGUOUS).all() and result.has_notice(AlignNotice.OTHER_BACKGROUND).all()
+    told = [n for n in result.notices if n.code == AlignNotice.OTHER_BACKGROUND]
+    assert all(abs(n.values["still"] + n.value - 70) <= 5 and abs(n.value - min(still, 70 - still)) <= 4 for n in told)
+    assert "static=" in told[0].text
+    # who knows what stands still, or that most does, has an answer
+    known = (torch.arange(70) < 5).expand(10, 70)
+    settled = align_planar(*views, static=known, generator=draw)
+    assert (settled.status == Status.OK).all()
+    assert error(settled, [torch.eye(3, dtype=torch.float64).expand(10, 3, 3)] * 2).max() < 3
+    most = align_planar(*views, generator=draw, options=dyn.AlignOptions(min_static_share=0.45))
+    assert (most.status == Status.OK).all()
+
+
+@pytest.mark.slow
+def test_movers_that_differ_leave_no_other_background():
+    draw = generator(20)
+    for still in (0.2, 0.35, 0.6):
+        scene = scenes.planar(90, batch=20, sigma=0.5, static=still, generator=draw)
+        assert (align_planar(*scene.views, generator=draw).status == Status.OK).all()

@@ -17,8 +17,9 @@ from dyntorch.geometry.rigid import moved_by, nearest_rotation, rigid_alignment,
 from dyntorch.metrics import label_scores, point_error, relative_error, rotation_error, translation_error
 from dyntorch.tasks.align import labelling
 from dyntorch.tasks.align.points import Model, align_points
-from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC
+from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, AlignNotice
 from dyntorch.tasks.align.rigid import RigidSightings, normal_equations, squares
+from tests.battery.steps import convoy
 
 F64 = torch.float64
 
@@ -273,6 +274,28 @@ def test_random_matches_are_refused_with_the_noise_unknown(model: Model) -> None
     assert found.status in (Status.NO_CONSENSUS, Status.DEGENERATE)
     assert not found.covariance.isnan().any() and not found.labels.any()
     assert found.sigma == 0 and "0 static, 0 moving, 60 outlier" in repr(found)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["join", "rigid"])
+def test_a_convoy_and_what_it_passes_are_each_others_background(model: Model) -> None:
+    views = convoy(2, 90, still=30, step=(0.3, -0.2, 0.1), sigma=0.01, size=4.0, generator=draw(52))
+    found = align_points(*views, model=model, threshold=0.03, generator=draw(53))
+    assert (found.status == Status.AMBIGUOUS).all() and bool(found.has_notice(AlignNotice.OTHER_BACKGROUND).all())
+    known = (torch.arange(90) < 6).expand(2, 90)
+    settled = align_points(*views, model=model, threshold=0.03, static=known, generator=draw(53))
+    assert (settled.status == Status.OK).all() and (settled.labels[:, :30] == STATIC).double().mean() > 0.95
+
+
+def test_static_points_carry_a_rigid_sensor_among_random_movers() -> None:
+    x1 = 4 * torch.rand(8, 60, 3, generator=draw(54), dtype=F64)
+    wild = (torch.arange(60) >= 36)[:, None] * 0.4
+    views = [x1, *(x1 + wild * torch.randn(x1.shape, generator=draw(seed), dtype=F64) for seed in (55, 56))]
+    views = [x + 0.01 * torch.randn(x1.shape, generator=draw(57 + k), dtype=F64) for k, x in enumerate(views)]
+    found = align_points(*views, model="rigid", threshold=0.03, generator=draw(60))
+    assert (found.status == Status.OK).all()
+    # within lines alone, movers could carry what stands still along
+    assert (found.labels[:, :36] == STATIC).double().mean() > 0.95 and (found.A[:, :3, 3]).norm(dim=-1).max() < 0.05
 
 
 def test_empty_batch_and_float32() -> None:
