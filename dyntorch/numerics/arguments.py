@@ -50,7 +50,7 @@ def refuse_vmap(name: str, value: Tensor, remedy: str = "give all problems at on
         raise ValueError(f"{name} is mapped over by torch.func.vmap; {remedy}")
 
 
-def check_threshold(threshold: float | None, estimated: bool = True) -> None:
+def check_threshold(threshold: float | None, estimated: bool = True, name: str = "threshold") -> None:
     """Refuse what is not one distance, or None where that means that it is ``estimated``."""
     try:
         value = 1.0 if threshold is None and estimated else float(threshold)  # type: ignore[arg-type]
@@ -58,7 +58,7 @@ def check_threshold(threshold: float | None, estimated: bool = True) -> None:
         value = float("nan")
     if not 0 < value < float("inf"):
         remedy = "None estimates it" if estimated else "2.5 pixels are right for most"
-        raise ValueError(f"threshold must be a positive distance in the unit of the points, got {threshold!r}; {remedy}")
+        raise ValueError(f"{name} must be a positive distance in the unit of the points, got {threshold!r}; {remedy}")
 
 
 def check_weights(weights: Tensor | None, what: str) -> None:

@@ -2,16 +2,18 @@ r"""Trajectory triangulation: points that move on straight lines, at any speed, 
 
 from __future__ import annotations
 
-import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import Any
+from typing import Any, ClassVar
 
+import numpy as np
 import torch
+from scipy.special import chdtri, fdtri
 from torch import Tensor
 
 from dyntorch.core.fit import fit
-from dyntorch.core.outcome import Outcome, Status, is_failure
+from dyntorch.core.outcome import REMEDY, Outcome, Status, is_failure
 from dyntorch.geometry.extensors import (
     cameras_of_lines,
     compound,
@@ -22,7 +24,7 @@ from dyntorch.geometry.extensors import (
 )
 from dyntorch.geometry.homogeneous import inhomogeneous, unit
 from dyntorch.invariants.grassmann_tensor import GrassmannTensor
-from dyntorch.numerics.arguments import check_options, on_cpu
+from dyntorch.numerics.arguments import check_options, check_tensor, check_threshold, check_weights, on_cpu
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.numerics.nullspace import gram_null_space
 from dyntorch.tasks.trajectories.line_fits import LineFit, LineSightings, adjust, fit_lines, fit_points, normalize_sightings
@@ -55,9 +57,13 @@ class LineStatus(IntEnum):
     """Other lines fit as well within the noise (the point hardly moves, or its rays lie almost in a plane).  The line is one."""
     TWO_FOLD = 4
     """Four views: two lines fulfil them exactly, ``lines`` and ``second``; nothing tells which of them is true."""
+    MISFIT = 5
+    """The distances from the best line, the one given, exceed the noise: the path is curved, or a sighting or a camera wrong."""
 
 
-STATUS_OF_LINES = torch.tensor([Status.OK, Status.TOO_FEW, Status.DEGENERATE, Status.AMBIGUOUS, Status.AMBIGUOUS])
+STATUS_OF_LINES = torch.tensor(
+    [Status.OK, Status.TOO_FEW, Status.DEGENERATE, Status.AMBIGUOUS, Status.AMBIGUOUS, Status.NO_CONSENSUS]
+)
 """The status of a :class:`LineStatus`: every line would do for a point that stands still."""
 
 
@@ -74,6 +80,11 @@ class Trajectories(Outcome):
     kinds: Tensor  # ``(*batch, n)`` of :class:`LineStatus` values
 
     TASK = "triangulate_trajectories"
+    REMEDIES: ClassVar[Mapping[Status, str]] = {
+        **REMEDY,
+        Status.NO_CONSENSUS: "the noise does not explain how far the sightings are from any line; look for curved paths and "
+        "wrong sightings, or raise {arg:sigma}",
+    }
 
     def __repr__(self) -> str:
         """How many lines of each kind."""
@@ -101,6 +112,9 @@ def triangulate_trajectories(
     there the distances of the points to the image lines :math:`M_j L` are made least squares in the 4 parameters of the line.
     Speeds and times play no role, and the cameras may be projective, one of them repeated, moving or static.
 
+    Squared distances are those of noise, :math:`\sum_j d_j^2 \sim \sigma^2 \chi^2_{v - 4}` for a point in v views; one whose are
+    more (in one problem of a thousand by chance) does not move on a line, or a sighting is wrong: ``MISFIT``.
+
     A static point has three times infinitely many lines through it; it is recognised by its reprojection errors as a point.
 
     Conic trajectories are left out.  A conic of space has 8 parameters, and a view gives one condition, of degree 2 in its ray: 8
@@ -121,7 +135,8 @@ def triangulate_trajectories(
         :class:`Trajectories`, in the dtype and on the device of x.
 
     Raises:
-        ValueError: other shapes, fewer than four views, negative weights, or a sigma that is not positive.
+        ValueError: what is no tensor of floating point or has another shape, fewer than four views, no point, negative weights, or
+            a sigma that is not positive.
 
     Source: thesis section 1.3; Avidan and Shashua 2000, "Trajectory triangulation".  Four views, the nonlinear refinement and the
     tests for static points are derived here.
@@ -152,6 +167,7 @@ def triangulate_trajectories(
     # four views without two lines: noise has made them one
     uncertainty = torch.where((seen == VIEWS) & ~two, 1.0, (line.spread.sqrt() * least).clamp(max=1.0))
     single = torch.where(uncertainty > options.max_uncertainty, LineStatus.AMBIGUOUS, LineStatus.OK)
+    single = torch.where(_is_misfit(line.cost, seen, data, noise, sigma is None), LineStatus.MISFIT, single)
     kinds = torch.where(two, LineStatus.TWO_FOLD, single)
     kinds = torch.where(few, LineStatus.TOO_FEW, torch.where(static, LineStatus.STATIC, kinds))
     none = (few | static)[..., None]
@@ -206,22 +222,23 @@ def _nearest_on_lines(data: LineSightings, lines: Tensor) -> Tensor:
 
 def _check(cameras: Tensor, x: Tensor, weights: Tensor | None, sigma: float | None) -> Tensor:
     """Weights ``(*batch, views, n)`` float64, 0 where anything is missing."""
-    if cameras.ndim < 3 or cameras.shape[-2:] != (3, 4):
-        raise ValueError(f"cameras must be (*batch, views, 3, 4), got {tuple(cameras.shape)}")
-    if x.ndim != cameras.ndim or x.shape[-1] != 2 or x.shape[:-2] != cameras.shape[:-2]:
+    check_tensor("cameras", cameras, "views", 3, 4)
+    check_tensor("x", x, "views", "n", 2)
+    if x.ndim != cameras.ndim or x.shape[:-2] != cameras.shape[:-2]:
         raise ValueError(f"x must be (*batch, views, n, 2) for cameras {tuple(cameras.shape)}, got {tuple(x.shape)}")
     if cameras.shape[-3] < VIEWS:
         raise ValueError(
             f"cameras must have {VIEWS} or more views, got {cameras.shape[-3]}; three leave a family of lines, give more"
         )
-    if sigma is not None and not 0 < sigma < math.inf:
-        raise ValueError(f"sigma must be the noise of an image coordinate in px, above 0, got {sigma}; None estimates it")
+    if not x.shape[-2]:
+        raise ValueError(f"x must hold a point at least, got {tuple(x.shape)}; give what was seen")
+    check_threshold(sigma, name="sigma")
     if weights is None:
         weights = torch.ones_like(x[..., 0])
-    if weights.shape != x.shape[:-1]:
-        raise ValueError(f"weights must be {tuple(x.shape[:-1])}, one for each x, got {tuple(weights.shape)}")
-    if bool((weights < 0).any()):
-        raise ValueError(f"weights must not be negative, got {float(weights.min()):g}; use 0 to ignore a point")
+    if not isinstance(weights, Tensor) or weights.shape != x.shape[:-1]:
+        got = tuple(weights.shape) if isinstance(weights, Tensor) else weights
+        raise ValueError(f"weights must be a tensor {tuple(x.shape[:-1])}, one for each x, got {got!r}")
+    check_weights(weights, "a point")
     known = x.isfinite().all(-1) & cameras.isfinite().flatten(-2).all(-1)[..., None] & weights.isfinite()
     return torch.where(known, weights, 0.0).double()
 
@@ -262,6 +279,25 @@ def _noise(cost: Tensor, seen: Tensor) -> Tensor:
     share = cost / (free * (1 - 2 / (9 * free)) ** 3)
     ranked = torch.where(seen > VIEWS, share, torch.nan)
     return ranked.nanmedian(-1).values.nan_to_num(nan=0.0).sqrt()
+
+
+MISFIT_LEVEL = 1e-3  # chance that the noise alone makes any line of a problem a misfit
+MEDIAN_EFFICIENCY = 0.6  # degrees of freedom that a median of squares is worth, of those that it is taken of
+MIN_MISFIT = 1e-6  # RMS in units of the normalized images that rounding never leaves
+
+
+def _is_misfit(cost: Tensor, seen: Tensor, data: LineSightings, noise: Tensor, estimated: bool) -> Tensor:
+    """Whether the squares of a line ``(*batch, n)`` are more than those of noise: chi-square with ``seen - 4`` degrees of freedom,
+    or Fisher's F where the noise is that of all lines."""
+    views, n = data.weights.shape[-2:]
+    free = np.arange(1, max(views - VIEWS, 1) + 1)
+    tail = MISFIT_LEVEL / n
+    limits = fdtri(free, MEDIAN_EFFICIENCY * n * free, 1 - tail) * free if estimated else chdtri(free, tail)
+    limit = torch.tensor(limits, dtype=cost.dtype, device=cost.device)[(seen - VIEWS - 1).clamp(min=0)]
+    # less weight is not less noise
+    share = cost / data.weights.amax((-2, -1)).clamp(min=torch.finfo(cost.dtype).tiny)[..., None]
+    variance = torch.maximum(noise[..., None].square(), (MIN_MISFIT / data.unit[..., 0, :]).square())
+    return (seen > VIEWS) & (share > limit * variance)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -335,10 +371,11 @@ def trajectory_cameras(
     """
     options = TrajectoryOptions() if options is None else options
     check_options(options, TrajectoryOptions)
-    if x.ndim < 3 or x.shape[-3] != 6 or x.shape[-1] != 2:
-        raise ValueError(f"x must be (*batch, 6, n, 2), six views, got {tuple(x.shape)}")
-    if weights is not None and weights.shape != (*x.shape[:-3], x.shape[-2]):
-        raise ValueError(f"weights must be (*batch, n) = {(*x.shape[:-3], x.shape[-2])}, one per point, got {tuple(weights.shape)}")
+    check_tensor("x", x, 6, "n", 2)
+    check_threshold(sigma, name="sigma")
+    if weights is not None and (not isinstance(weights, Tensor) or weights.shape != (*x.shape[:-3], x.shape[-2])):
+        got = tuple(weights.shape) if isinstance(weights, Tensor) else weights
+        raise ValueError(f"weights must be a tensor (*batch, n) = {(*x.shape[:-3], x.shape[-2])}, one per point, got {got!r}")
     flat = x.reshape(-1, *x.shape[-3:]).double()
     mass = torch.ones_like(flat[:, 0, :, 0]) if weights is None else weights.reshape(flat.shape[0], -1).double()
     solution = fit(SIX, *flat.unbind(1), weights=mass)

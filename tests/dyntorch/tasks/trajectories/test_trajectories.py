@@ -1,9 +1,12 @@
 """Straight trajectories against the truth: five and more views, four views, static points, missing views, noise, the tensor."""
 
+import math
+
 import pytest
 import torch
 
 from dyntorch import TrajectoryOptions
+from dyntorch.core.outcome import Status
 from dyntorch.geometry.extensors import plucker
 from dyntorch.geometry.homogeneous import apply, homogeneous, inhomogeneous
 from dyntorch.scenes.scene import calibration, looking_at
@@ -99,6 +102,34 @@ def test_noise_is_estimated_and_the_uncertainty_is_honest():
     assert (kinds == LineStatus.STATIC).double().mean() > 0.98
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("sigma", [0.5, None])
+def test_noise_makes_one_problem_in_a_thousand_a_misfit(sigma):
+    cameras, x, _, _ = scene(7, 12, (1000,), sigma=0.5)
+    found = triangulate_trajectories(cameras, x, sigma=sigma)
+    # 5 or more of 1000 at a rate of 1: 4 in 1000
+    assert (found.kinds == LineStatus.MISFIT).any(-1).sum() < 5
+    assert (found.kinds == LineStatus.OK).double().mean() > 0.98
+
+
+@pytest.mark.parametrize("sigma", [0.5, None])
+def test_curved_paths_and_wrong_sightings_are_no_lines(sigma):
+    cameras, x, points, _ = scene(9, 40, (5,), sigma=0.5)
+    angle = 0.6 * torch.arange(9).double()
+    circle = torch.stack([angle.cos(), angle.sin(), 0.3 * (2 * angle).sin()], dim=-1)[:, None]
+    x = x.clone()
+    x[..., :4, :] = apply(cameras, (points[..., :1, :4, :] + circle))
+    x[..., 4, 4:8, :] += 60.0
+    found = triangulate_trajectories(cameras, x, sigma=sigma)
+    assert (found.kinds[..., :8] == LineStatus.MISFIT).double().mean() > 0.9
+    # what a path does along the line of sight, and a shift along an image line, shows in no residual
+    assert (found.status[..., :8] == Status.OK).double().mean() < 0.1 and (
+        found.kinds[..., 8:] == LineStatus.OK
+    ).double().mean() > 0.95
+    with pytest.raises(ValueError, match=r"NO_CONSENSUS.*curved paths"):
+        found.check()
+
+
 def test_refinement_is_a_minimum_and_options_decide():
     cameras, x, _, _ = scene(6, 20, sigma=0.5)
     found = triangulate_trajectories(cameras, x)
@@ -182,8 +213,18 @@ SIX = torch.zeros(6, 10, 2)
         (triangulate_trajectories, {"cameras": torch.zeros(3, 3, 4), "x": torch.zeros(3, 2, 2)}, "4 or more views, got 3"),
         (triangulate_trajectories, {"weights": torch.ones(5)}, "weights must be"),
         (triangulate_trajectories, {"weights": -torch.ones(5, 2)}, "must not be negative, got -1"),
-        (triangulate_trajectories, {"sigma": 0.0}, "sigma must be"),
-        (trajectory_cameras, {"x": SIX[:5]}, "six views"),
+        *(
+            (triangulate_trajectories, {"sigma": bad}, "sigma must be .* None estimates it")
+            for bad in (0.0, -1.0, "wide", math.nan)
+        ),
+        *(
+            (triangulate_trajectories, {"x": bad}, "x must be .*got")
+            for bad in ([[1.0]], None, "x", SIX.cfloat(), SIX.int(), SIX.bool())
+        ),
+        (triangulate_trajectories, {"cameras": None}, r"cameras must be a torch.Tensor, got NoneType; use torch.as_tensor"),
+        (triangulate_trajectories, {"x": torch.zeros(5, 0, 2)}, r"x must hold a point at least, got \(5, 0, 2\)"),
+        (triangulate_trajectories, {"weights": [1.0]}, r"weights must be a tensor .*got \[1.0\]"),
+        (trajectory_cameras, {"x": SIX[:5]}, r"x must be \(\*batch, 6, n, 2\), got \(5, 10, 2\)"),
         (
             trajectory_cameras,
             {"x": SIX, "weights": torch.ones(6, 10)},
