@@ -16,6 +16,13 @@ from dyntorch.core.outcome import Notice, NoticeCode, Outcome, Status
 class SegmentNotice(NoticeCode):
     """What limits a segmentation of matches or of tracks, and how it is said."""
 
+    MISFIT = (
+        "misfit",
+        "the matches of a body are off its motion as by a noise of {value:.2g}, {limit:.2g} at most by {arg:threshold}: it bends, "
+        "or several move; if the noise is so large, raise {arg:threshold}",
+        Status.NO_CONSENSUS,
+    )
+    """A body does not move rigidly, within the noise."""
     COARSE = (
         "coarse",
         "the threshold is {value:.2g} of the spread of the points, and everything is near everything; give it in their unit",
@@ -42,10 +49,15 @@ class SegmentNotice(NoticeCode):
     """Fewer bodies than were asked for explain the data as well."""
     UNDECIDED = (
         "undecided",
-        "two views hardly decide: another segmentation costs {value:.2g} more, and from 1 on it would be clear; follow the points "
-        "through more frames (segment_tracks)",
+        {
+            "": "two views hardly decide: another segmentation costs {value:.2g} more, and from 1 on it would be clear; follow the "
+            "points through more frames (segment_tracks)",
+            "one": "whether anything moves against the rest is open: two bodies explain the matches closer, by {value:.2g}, and "
+            "only the penalty of {penalty:.2g} for a body speaks against them; something moves a little, or a lens bends the "
+            "picture; take frames farther apart, or follow the points through more of them (segment_tracks)",
+        },
     )
-    """Another segmentation costs about as much."""
+    """Another segmentation costs about as much, or two bodies less than one before the penalty for a body."""
     REPEATED = ("repeated", "a share of {value:.2g} of the matches repeats others and says nothing new; remove repeated matches")
     """Many matches are the same."""
     INCOHERENT = (

@@ -66,6 +66,7 @@ MIN_RUNNER_UP_COST = 1.0  # beyond the least cost, in units of the root of the n
 FAR_DISTANCE = 20.0  # from the middle, over the median one: garbage where neighbours do not matter
 MAX_DISTANCE = 1e3  # from the middle of the matches, over the median one, to which farther ones are moved
 MAX_RELATIVE_THRESHOLD = 0.2  # over the spread of the points, from which the problem is refused
+MAX_NOISE_RATIO = 2.5  # noise of a body over that of the threshold: rigid ones up to .96 px at 2.5 px, bending sheets from 2.3
 MAX_REPEATED_SHARE = 0.1  # of the matches, without a notice
 MIN_LINKED_SHARE = 0.3  # of the matches, without a notice
 
@@ -89,6 +90,8 @@ class CountSelection:
     spare: bool = False  # whether fewer bodies than were asked for cost less, penalties included
     rival: float = inf
     """What the best other segmentation into as many costs more, in units of the root of the number of matches."""
+    gain: float = 0.0
+    """What one body more costs less before its penalty, in the same units, where the number was not asked for."""
 
 
 def select_count(search: Search, matches: int, bodies: int | None, penalty: float, max_bodies: int) -> CountSelection | None:
@@ -123,7 +126,10 @@ def select_count(search: Search, matches: int, bodies: int | None, penalty: floa
     if not best_by_count:
         return None
     count = min(best_by_count, key=penalized_cost)
-    return CountSelection(best_by_count[count], rival=rivals[count])
+    further = best_by_count.get(count + 1, best_by_count[count])
+    return CountSelection(
+        best_by_count[count], rival=rivals[count], gain=(best_by_count[count].energy - further.energy) / matches**0.5
+    )
 
 
 def _runner_up_cost(candidates: Sequence[Candidate]) -> float:
@@ -193,7 +199,14 @@ def _describe_bodies(
     labels, fundamentals = labelled.labels, labelled.fundamentals
     count = len(fundamentals)
     rival = [Notice(SegmentNotice.UNDECIDED, chosen.rival)] if count > 1 and chosen.rival < MIN_RUNNER_UP_COST else []
-    notices = [*count_notices(count, request.bodies, chosen.spare), *rival, *notices]
+    limit = MAX_NOISE_RATIO * threshold / THRESHOLD_SIGMAS
+    worst = max((_noise_of_bodies(given.view, labels, fundamentals) / given.scale).tolist(), default=0.0)
+    misfit = [Notice(SegmentNotice.MISFIT, worst, {"limit": limit})] if worst > limit else []
+    # no probability: lenses bend recordings of one body as much as small motions of a second one (half of them are noted)
+    if count == 1 and chosen.gain > 0:
+        penalty = BODY_PENALTY if request.spatial else BODY_PENALTY_GEOMETRY_ONLY
+        rival = [Notice(SegmentNotice.UNDECIDED, chosen.gain, {"case": "one", "penalty": penalty})]
+    notices = [*misfit, *count_notices(count, request.bodies, chosen.spare), *rival, *notices]
     if not count:
         return _no_bodies(given.weights, threshold, Status.NO_CONSENSUS, notices)
     homographies, planar = select_models(given.view, fundamentals, one_hot(labels - 1, count) * given.weights[given.present])
@@ -209,9 +222,16 @@ def _describe_bodies(
         threshold=given.weights.new_tensor(threshold),
         fundamentals=unit(given.second.mT @ fundamentals @ given.first),
         coherence=given.spread(given.coherence),
-        status=torch.tensor(int(Status.OK if request.bodies in (None, count) else Status.NO_CONSENSUS)),
+        status=torch.tensor(int(Status.OK if request.bodies in (None, count) and not misfit else Status.NO_CONSENSUS)),
         notices=tuple(notices),
     )
+
+
+def _noise_of_bodies(view: View, labels: Tensor, fundamentals: Tensor) -> Tensor:
+    """Standard deviations ``(K,)`` of a coordinate that the median distances from each body's epipolar lines show."""
+    square = sampson_squared(fundamentals, view.x1, view.x2)
+    own = labels == torch.arange(1, len(fundamentals) + 1, device=labels.device)[:, None]
+    return (torch.where(own, square, torch.nan).nanmedian(-1).values / median(1)).sqrt()
 
 
 def _sort_bodies(labelled: Labelling) -> Labelling:
@@ -368,7 +388,8 @@ def segment(
         bodies: how many; None finds out.
         threshold: Sampson distance in the unit of the points, about five standard deviations of the noise of a coordinate, at which
             a match may as well be an outlier; one that moves like its neighbours may be up to three times as far from its body.
-            All scales follow it.  None estimates it from the matches, in twice the time.
+            All scales follow it; a body whose distances show a noise of half of it and more is none (``NO_CONSENSUS``, notice
+            ``misfit``).  None estimates it from the matches, in twice the time.
         weights: ``(*batch, n)`` not negative; 0 leaves a match out, others weigh it in the last fits of the bodies, not in the
             search for them.
         spatial: whether bodies are regions of the images.  False for bodies that interleave, such as transparent motions or

@@ -345,6 +345,43 @@ def test_one_body(bodies):
     assert int((found.labels == 0).sum()) <= 4
 
 
+@pytest.mark.slow
+def test_sheets_that_bend_are_no_bodies():
+    refused = 0
+    for seed in range(8):
+        place = torch.rand(130, 3, generator=draw(seed), dtype=F64) * 2 - 1 + torch.tensor([0.0, 0.0, 7.0], dtype=F64)
+        waves = torch.stack([(2 * place[:, 1]).sin(), (3 * place[:, 0]).cos(), (2 * place[:, 2]).sin()], dim=-1)
+        x1, x2 = (900 * x[:, :2] / x[:, 2:] for x in (place, place + 0.25 * waves))
+        x1, x2 = (x + 0.5 * torch.randn(x.shape, generator=draw(20 + seed), dtype=F64) for x in (x1, x2))
+        found = checked(x1, x2)
+        refused += int(found.status) == Status.NO_CONSENSUS and SegmentNotice.MISFIT in codes(found)
+    assert refused >= 7
+    rigid = [segmented(scene_of(120, 2, seed, sigma=1.0, outliers=0.2)) for seed in range(8)]
+    assert not any(SegmentNotice.MISFIT in codes(found) for found in rigid)
+
+
+def small_motion(seed, size):
+    """Two bodies side by side whose motions differ by about ``size`` pixels, at a noise of .5."""
+    place = torch.rand(2, 65, 3, generator=draw(seed), dtype=F64) * 2 - 1
+    turn, shift = (
+        part * size * torch.randn(2, 1, 3, generator=draw(seed + k), dtype=F64) for k, part in ((40, 0.003), (60, 0.008))
+    )
+    moved = place + torch.linalg.cross(turn.expand_as(place), place) + shift
+    centre = torch.tensor([[[-1.2, 0.0, 7.0]], [[1.2, 0.0, 7.0]]], dtype=F64)
+    images = [(900 * x[..., :2] / x[..., 2:]).flatten(0, 1) for x in (place + centre, moved + centre)]
+    return [x + 0.5 * torch.randn(x.shape, generator=draw(seed + 80 + k), dtype=F64) for k, x in enumerate(images)]
+
+
+@pytest.mark.slow
+def test_what_moves_hardly_more_than_the_noise_is_no_body_without_a_word():
+    found = [dyn.segment(*small_motion(seed, 1.5), generator=draw(0)) for seed in range(12)]
+    silent = [SegmentNotice.UNDECIDED not in codes(one) for one in found if int(one.bodies) == 1]
+    assert len(silent) >= 6 and sum(silent) <= 0.5 * len(silent)
+    still = [dyn.segment(*small_motion(seed, 0.0), generator=draw(0)) for seed in range(12)]
+    clear = [dyn.segment(*scene_of(120, 1, seed).views, generator=draw(0)) for seed in range(12)]
+    assert sum(SegmentNotice.UNDECIDED in codes(one) for one in [*still, *clear]) <= 2
+
+
 @pytest.mark.parametrize("threshold", [2.5, None])
 def test_a_static_pair_is_one_body_of_a_homography(threshold):
     found = checked(X1, X1, threshold=threshold).check()
