@@ -16,18 +16,18 @@ PACKAGES = ("dyntorch", "indexing")
 MAX_FIELDS = 12
 """Fields of the options of one verb."""
 BOUNDS = {
-    "files": 349,
-    "lines": 94_480,
-    "code lines": 58_540,
-    "docstring lines": 14_410,
+    "files": 350,
+    "lines": 94_598,
+    "code lines": 58_605,
+    "docstring lines": 14_437,
     "option fields": 111,
     "option fields that nobody sets": 0,
     "functions called by an everyday word": 2,
     "imports of our own inside functions": 29,
     "circles of imports": 0,
     "circles of imports, those for types too": 0,
-    "lines of experiments": 19_000,
-    "lines of tests": 54_376,
+    "lines of experiments": 19_096,
+    "lines of tests": 54_427,
 }
 """What each figure may be at most."""
 

@@ -1,26 +1,24 @@
 """What the microphones of two cameras heard: a witness to how their clocks run, or, where asked, the only one.
 
 Two microphones in one room do not record one waveform: reverberation, automatic gain and the electronics differ.  What they share
-is *when* it gets loud, and at which pitch.  So the sound is cut into bands of pitch, the logarithm of the energy in each is taken
-over time (its envelope), and the envelopes are compared by the generalized cross-correlation with phase transform: every rate of
-change counts alike, however much of it there is, which makes the correlation of anything but a repeating sound a single peak.
+is *when* it gets loud, and at which pitch: the envelopes of :mod:`indexing.sync.soundtrack`.  They are compared by the generalized
+cross-correlation with phase transform: every rate of change counts alike, however much of it there is, which makes the correlation
+of anything but a repeating sound a single peak.
 
 A peak must have many moments behind it.  One clap fits any other clap; what speaks for a shift is the sum of what short stretches
 of the overlap say, over the root of the sum of their squares.  By chance this ratio exceeds t with a probability of at most
-exp(-t^2 / 2), however loud single moments are, and the same ratio of the differences between the best shift and the next one says
-whether a sound that repeats leaves the two apart.
+exp(-t^2 / 2), however loud single moments are.  A sound that repeats itself has rivals of the best shift, and is like itself at
+their distance; what only one of the microphones hears makes the loudness of both less coherent.  A logistic regression makes one
+probability of these figures (``sound_decision.json``, by ``python -m experiments.synchronization.sound --write``).
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
-from itertools import pairwise
+from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -28,27 +26,11 @@ from numpy.typing import NDArray
 
 from dyntorch import Shift, Status
 from dyntorch.core import Notice, NoticeCode, status_from
-from indexing.opening import size_of
+from dyntorch.numerics.logistic import DecisionModel
 from indexing.sync.recordings import undecided_shift
-from indexing.video.reading import av, open_video, packets
+from indexing.sync.soundtrack import HOP_SECONDS, STEP_SECONDS, Sound, block_means
 
-Signal = NDArray[np.float32]
-
-
-CHUNK = 20_000  # spectra at once: 20 MB
-
-
-SAMPLE_RATE = 16_000  # Samples per second of all sound: the bands below need no more.
-SILENCE_AMPLITUDE = 3e-4  # Share of full scale: 10 steps of 16 bits are rounding.
-MIN_PITCH_HERTZ = 200.0  # Below are hum of the mains, wind and hands on the phone.
-MAX_PITCH_HERTZ = 7000.0  # What phones' noise suppression leaves.
-NUM_BANDS = 8  # Bands of pitch, of equal ratio.
-WINDOW_SECONDS = 0.01  # Window of a spectrum.
-HOP_SECONDS = 0.002  # From one spectrum to the next, of the envelopes that offset and rate are estimated from.
-STEP_SECONDS = 0.01  # Step of the envelopes in which shifts are searched.
-# Average of magnitudes in the phase transform (margin, music at 10 dB, 0 / .05 / .5 Hz: 7.3 / 7.4 / 5.0).
-SPECTRUM_SMOOTHING_HERTZ = 0.05
-MIN_MODULATION_HERTZ = 0.5  # Slower changes of loudness are those of automatic gain.
+Floats = NDArray[np.float64]
 
 
 class SoundNotice(NoticeCode):
@@ -76,6 +58,19 @@ class SoundNotice(NoticeCode):
         Status.AMBIGUOUS,
     )
     """Several peaks, as of a metronome."""
+    DIFFERENT = (
+        "sound_differs",
+        "at {value:+.3f} s much is loud at one microphone only, as where one recording was played in two takes, or in much noise; "
+        "clap at some uneven moments",
+        Status.AMBIGUOUS,
+    )
+    """Much of what is loud is loud at one microphone only."""
+    SYSTEMATIC = (
+        "sound_systematic",
+        "sigma is that of the sound at the microphones: a source {metres:g} m nearer to one, and sound that is late in its file, "
+        "add some {value:.3f} s; one recording that was played in two takes sounds like one event",
+    )
+    """What sound alone cannot know."""
     AGREES = "sound_agrees", "sound agrees: {value:+.3f} s"
     """The sound says the same; the value is how much later."""
     OPEN = "sound_open", "the sound does not decide: {why}"
@@ -91,172 +86,6 @@ class SoundNotice(NoticeCode):
     """The sound says something else."""
 
 
-@dataclass(frozen=True, eq=False)
-class Sound:
-    """What a camera's microphone recorded. samples ``(n,)``."""
-
-    samples: NDArray[Any]
-    rate: float
-    start: float = 0.0
-
-    def __post_init__(self) -> None:
-        samples = np.asarray(self.samples)
-        if samples.ndim != 1 or samples.dtype.kind not in "fi":
-            raise ValueError(f"samples: expected one channel (n,) of numbers, got shape {samples.shape} of {samples.dtype}")
-        if not 0 < self.rate < math.inf:
-            raise ValueError(f"rate: expected a positive number of samples per second, got {self.rate!r}")
-
-    @property
-    def seconds(self) -> float:
-        """How long it is."""
-        return len(self.samples) / self.rate
-
-    @property
-    def silent(self) -> bool:
-        """Whether nothing but the rounding of its samples can be heard."""
-        loudest = float(np.abs(self.samples.astype(np.float32)).max(initial=0.0))
-        scale = 32768.0 if self.samples.dtype.kind == "i" else 1.0
-        return loudest / scale < SILENCE_AMPLITUDE
-
-    @property
-    def first(self) -> float:
-        """Seconds of the middle of the first frame of :attr:`energy`."""
-        return self.start + WINDOW_SECONDS / 2
-
-    @cached_property
-    def energy(self) -> Signal:
-        """``(bands, frames)`` energy of each band of pitch, ``HOP_SECONDS`` seconds apart."""
-        from scipy import fft, signal
-
-        made = self.samples.astype(np.float32) / (32768.0 if self.samples.dtype.kind == "i" else 1.0)
-        if self.rate != SAMPLE_RATE:
-            share = math.gcd(round(self.rate), SAMPLE_RATE)
-            made = signal.resample_poly(made, SAMPLE_RATE // share, round(self.rate) // share).astype(np.float32)
-        hop, width = round(HOP_SECONDS * SAMPLE_RATE), round(WINDOW_SECONDS * SAMPLE_RATE)
-        if len(made) < width:
-            return np.zeros((NUM_BANDS, 0), np.float32)
-        cut = np.lib.stride_tricks.sliding_window_view(made, width)[::hop]
-        size = fft.next_fast_len(2 * width, real=True)
-        pitch = fft.rfftfreq(size, 1 / SAMPLE_RATE)
-        edges = np.geomspace(MIN_PITCH_HERTZ, MAX_PITCH_HERTZ, NUM_BANDS + 1)
-        bands = [(pitch >= low) & (pitch < high) for low, high in pairwise(edges)]
-        taper = np.hanning(width).astype(np.float32)
-        found = np.empty((len(bands), len(cut)), np.float32)
-        for begin in range(0, len(cut), CHUNK):
-            power = np.abs(fft.rfft(cut[begin : begin + CHUNK] * taper, size, axis=1)) ** 2
-            for band, chosen in enumerate(bands):
-                found[band, begin : begin + CHUNK] = power[:, chosen].sum(axis=1)
-        return found
-
-    @cached_property
-    def fine(self) -> Signal:
-        """``(bands, frames)`` envelopes of unit variance whose changes count alike at every rate, ``HOP_SECONDS`` apart."""
-        return self._envelopes(self.energy, HOP_SECONDS)
-
-    @cached_property
-    def coarse(self) -> Signal:
-        """The same, ``STEP_SECONDS`` seconds apart."""
-        many = round(STEP_SECONDS / HOP_SECONDS)
-        whole = self.energy[:, : self.energy.shape[1] // many * many]
-        return self._envelopes(whole.reshape(len(whole), -1, many).mean(axis=2), STEP_SECONDS)
-
-    def _envelopes(self, energy: Signal, step: float) -> Signal:
-        if not energy.shape[1]:
-            return energy
-        quiet = np.quantile(energy, 0.5, axis=1, keepdims=True) + 1e-9 * energy.max() + np.finfo(np.float32).tiny
-        return phase_transform(np.log(energy + quiet), 1 / step, SPECTRUM_SMOOTHING_HERTZ, MIN_MODULATION_HERTZ)
-
-
-def phase_transform(curves: Signal, rate: float, smooth: float, slowest: float) -> Signal:
-    """The phase transform of curves: each frequency divided by its magnitude, smoothed over its neighbours. curves ``(k, n)``
-    -> ``(k, n)``."""
-    from scipy import fft, ndimage
-
-    length = curves.shape[1]
-    size = fft.next_fast_len(length + int(rate), real=True)
-    spectrum = fft.rfft(curves - curves.mean(axis=1, keepdims=True), size, axis=1)
-    near = 2 * int(smooth * size / rate) + 1
-    magnitude = np.sqrt(ndimage.uniform_filter1d(np.abs(spectrum) ** 2, near, axis=1))
-    magnitude += 1e-3 * magnitude.max(axis=1, keepdims=True) + np.finfo(np.float32).tiny
-    spectrum = np.where(fft.rfftfreq(size, 1 / rate) >= slowest, spectrum / magnitude, 0)
-    made = fft.irfft(spectrum, size, axis=1)[:, :length]
-    return np.asarray(made / np.sqrt((made**2).mean(axis=1, keepdims=True)).clip(1e-12), dtype=np.float32)
-
-
-# ----------------------------------------------------------------------------------------------------------------------
-# Listening to a file.
-
-
-def read_sound(path: str | Path) -> Sound | None:
-    """The sound of a video, on the clock of its pictures; None where it has none."""
-    path = Path(path).expanduser()
-    try:
-        changed = path.stat().st_mtime_ns, size_of(path)
-    except (OSError, ValueError):
-        changed = (0, 0)  # opening it says what is wrong
-    return _read_sound(path, changed)
-
-
-@lru_cache(maxsize=16)
-def _read_sound(path: Path, changed: tuple[int, int]) -> Sound | None:
-    with open_video(path) as (container, pictures):
-        streams = [stream for stream in container.streams.audio if stream.codec_context is not None]
-        if not streams:
-            return None
-        zero = float((pictures.start_time or 0) * pictures.time_base)
-        parts = list(_stretches(container, streams[0]))
-    if not parts:
-        return None
-    start = min(began for began, _ in parts)
-    end = max(began + len(piece) / SAMPLE_RATE for began, piece in parts)
-    samples = np.zeros(math.ceil((end - start) * SAMPLE_RATE) + 1, np.int16)
-    for began, piece in parts:
-        at = round((began - start) * SAMPLE_RATE)
-        samples[at : at + len(piece)] = piece[: len(samples) - at]
-    return Sound(samples, float(SAMPLE_RATE), start - zero)
-
-
-MAX_TIMESTAMP_ERROR_SECONDS = 0.02  # Timestamps that are farther off the samples are a gap; Matroska rounds to .001.
-
-
-def _stretches(container: Any, stream: Any) -> Iterator[tuple[float, NDArray[np.int16]]]:
-    """When each stretch of sound without a gap begins, and its samples at the common rate."""
-    pieces: list[NDArray[np.int16]] = []
-    began = expected = 0.0
-    form: Any = None
-    resampler: Any = None
-
-    def flush() -> NDArray[np.int16]:
-        pieces.extend(made.to_ndarray()[0] for made in resampler.resample(None))
-        return np.concatenate(pieces) if pieces else np.zeros(0, np.int16)
-
-    for frame in _frames(container, stream):
-        time = expected if frame.pts is None else float(frame.pts * frame.time_base)
-        now = (frame.sample_rate, frame.layout.name, frame.format.name)
-        if resampler is None or abs(time - expected) > MAX_TIMESTAMP_ERROR_SECONDS or now != form:
-            if resampler is not None:
-                yield began, flush()
-            pieces, form, began = [], now, time
-            expected, resampler = time, av().AudioResampler(format="s16", layout="mono", rate=SAMPLE_RATE)
-        pieces.extend(made.to_ndarray()[0] for made in resampler.resample(frame))
-        expected += frame.samples / frame.sample_rate
-    if resampler is not None:
-        yield began, flush()
-
-
-def _frames(container: Any, stream: Any) -> Iterator[Any]:
-    """Frames of sound for as long as any can be decoded."""
-    for packet in packets(container, stream, []):
-        try:
-            decoded = packet.decode()
-        except av().FFmpegError:
-            continue
-        yield from decoded
-
-
-Floats = NDArray[np.float64]
-
-
 MIN_OVERLAP_SECONDS = 2.0  # Time that both must have recorded at once.
 
 
@@ -267,18 +96,28 @@ def sound_shift(
     fps: tuple[float, float] = (30.0, 30.0),
     max_shift: float | None = None,
     rate: float | None = None,
+    risk: float = 0.002,
 ) -> Shift:
-    """How the clock of one camera runs against that of another, by what their microphones heard."""
+    """How the clock of one camera runs against that of another, by what their microphones heard.
+
+    ``ok`` where the ``confidence``, the probability that the offset is right, is at least 1 - risk.  It is that of recordings like
+    those of ``experiments.synchronization.sound``, in which one pair of a hundred with music is the same song in two takes: where
+    nothing else can be heard nothing tells those apart, so that it is .999 at most.  ``sigma`` (s) is that of the offset between
+    the microphones, room included; how much nearer the source is to one of them, and how late the sound of a file is, no sound
+    tells: a note says so, and :func:`check_by_sound` adds it.
+    """
     missing = [which for which, one in zip("ab", (a, b), strict=True) if one is None]
     if a is None or b is None:
         return undecided_shift(fps, "sound", *(Notice(SoundNotice.NONE, 0.0, {"which": which}) for which in missing))
     dead = [Notice(SoundNotice.SILENT, 0.0, {"which": which}) for which, one in zip("ab", (a, b), strict=True) if one.silent]
     if dead:
         return undecided_shift(fps, "sound", *dead)
+    if not 0 < risk < 1:
+        raise ValueError(f"risk must lie between 0 and 1, got {risk!r}")
     search = SoundSearch(a, b, max_shift, 0.0 if rate is None else rate - 1, rate is None)
     if not search.lags.size:
         return undecided_shift(fps, "sound", Notice(SoundNotice.SHORT, MIN_OVERLAP_SECONDS))
-    return search.shift(fps)
+    return search.shift(fps, risk)
 
 
 @dataclass(frozen=True)
@@ -295,13 +134,17 @@ MAX_PIECE_SECONDS = 30.0  # Within it a rate is neglected, 6 ms at most.
 NUM_PEAKS = 7  # Peaks that are compared.
 MIN_PEAK_SEPARATION_SECONDS = 0.1  # Within this a peak is the slope of a higher one: a band's envelope, and a room's first echoes.
 STRETCH_SECONDS = 0.03  # Time that speaks as one, a clap (experiments.synchronization.sound).
-MAX_CHANCE = 1e-2  # Bound of the probability of such evidence at any shift by chance.
-# Evidence for the best shift over another one: wrong answers to a metronome reach 1.9, right ones have 2.9 and more.
-MIN_EVIDENCE_OVER_PEAK = 3.0
-DISTANCE_SIGMA_METRES = 3.0  # How much nearer the sound is to one camera.
-SPEED_OF_SOUND = 343.0  # Metres per second at 20 degrees.
-LATENCY_SIGMA_SECONDS = 0.015  # Between sound and pictures of a file: three sigmas are the 45 ms of ITU-R BT.1359-1.
+LOUDNESS_SECONDS = 0.05  # Over it the loudness is averaged whose coherence is a figure.
 MAX_CURVE_POINTS = 20_000  # Points of the curve that are returned.
+
+
+REPLAY_PROBABILITY = 1e-3
+"""One recording in two takes of which nothing tells: in training one of 300 pairs, a fifth of which is believed."""
+
+
+def decision_model() -> DecisionModel:
+    """Of whether a shift is right."""
+    return DecisionModel.load(Path(__file__).with_name("sound_decision.json"), "offset")
 
 
 class SoundSearch:
@@ -364,65 +207,109 @@ class SoundSearch:
             left[np.abs(self.lags - self.lags[at]) <= away] = -np.inf
         return found
 
+    def _frame_pairs(self, peak: SoundPeak) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Frames of a and of b that a shift puts at the same moments."""
+        rows = np.arange(self.a.coarse.shape[1])
+        other = rows + np.rint(peak.lag + peak.drift * (rows - self.middle)).astype(np.int64)
+        there = (other >= 0) & (other < self.b.coarse.shape[1])
+        return rows[there], other[there]
+
     def stretch_scores(self, peak: SoundPeak) -> Floats:
         """What each short stretch of a says for a shift; 0 where b recorded nothing."""
-        one, two = self.a.coarse, self.b.coarse
-        rows = np.arange(one.shape[1])
-        other = rows + np.rint(peak.lag + peak.drift * (rows - self.middle)).astype(np.int64)
-        there = (other >= 0) & (other < two.shape[1])
-        products = np.zeros(len(rows))
-        products[there] = np.einsum("kt,kt->t", one[:, there], two[:, other[there]])
-        size = max(1, round(STRETCH_SECONDS / STEP_SECONDS))
-        whole = np.pad(products, (0, -len(products) % size))
-        return np.asarray(whole.reshape(-1, size).sum(axis=1), dtype=np.float64)
+        one, two = self._frame_pairs(peak)
+        products = np.zeros(self.a.coarse.shape[1])
+        products[one] = np.einsum("kt,kt->t", self.a.coarse[:, one], self.b.coarse[:, two])
+        return stretch_sums(products)
 
-    def shift(self, fps: tuple[float, float]) -> Shift:
-        """The best shift, and whether it is to be believed."""
+    def _repetition(self, lag: int) -> float:
+        """Evidence that both sounds are like themselves some frames later."""
+        pairs = [(one.coarse[:, lag:], one.coarse[:, : max(0, one.coarse.shape[1] - lag)]) for one in (self.a, self.b)]
+        return min(evidence_ratio(stretch_sums(np.einsum("kt,kt->t", *pair))) for pair in pairs)
+
+    def _loudness(self, peak: SoundPeak) -> tuple[float, float]:
+        """Coherence (as Fisher's z) of the mean logarithmic loudness of both at a shift, and the log of how much it varies."""
+        curves = []
+        for one, rows in zip((self.a, self.b), self._frame_pairs(peak), strict=True):
+            energy = block_means(one.coarse_energy[:, rows], round(LOUDNESS_SECONDS / STEP_SECONDS))
+            quiet = np.quantile(energy, 0.2, axis=1, keepdims=True) + 1e-9 * energy.max() + np.finfo(np.float32).tiny
+            curve = np.log1p(energy / quiet).mean(axis=0)
+            curves.append(curve - curve.mean())
+        size = float(np.prod([np.sqrt((curve**2).mean()) for curve in curves]))
+        coherence = float((curves[0] * curves[1]).mean()) / size if size else 0.0
+        return math.atanh(min(max(coherence, -0.9), 0.99)), math.log(size + 1e-9)
+
+    def rank_peaks(self) -> tuple[list[SoundPeak], list[Floats]]:
+        """Peaks by their evidence, the best first (scores of short overlaps are of chance), and what stretches say for each."""
         peaks = self.peaks()
+        said = [self.stretch_scores(one) for one in peaks]
+        order = sorted(range(len(peaks)), key=lambda i: -evidence_ratio(said[i]))
+        return [peaks[i] for i in order], [said[i] for i in order]
+
+    def figures(self, peaks: list[SoundPeak], said: list[Floats]) -> dict[str, float]:
+        """What the decision is made from, of at least one peak, ranked; some stop where more of them says no more."""
+        strength = evidence_ratio(said[0])
+        rivals = [evidence_ratio(other) for other in said[1:]]
+        apart = [evidence_ratio(said[0] - other) for other in said[1:]]
+        again = [self._repetition(abs(round(one.lag - peaks[0].lag))) for one in peaks[1:]]
+        coherence, dynamics = self._loudness(peaks[0])
+        return {
+            "evidence_over_rivals": min(max(min(apart, default=strength), -3.0), 8.0),
+            "lead": strength - max(rivals, default=0.0),
+            "repetition": min(max(again, default=0.0), 12.0),
+            "coherence": coherence,
+            "dynamics": dynamics,
+        }
+
+    def shift(self, fps: tuple[float, float], risk: float) -> Shift:
+        """The best shift, and whether it is to be believed."""
+        peaks, said = self.rank_peaks()
         if not peaks:
             return undecided_shift(fps, "sound", Notice(SoundNotice.NOTHING, 0.0))
-        said = [self.stretch_scores(one) for one in peaks]
-        order = sorted(range(len(peaks)), key=lambda i: -evidence_ratio(said[i]))  # a score is of chance where the overlap is short
-        peaks, said = [peaks[i] for i in order], [said[i] for i in order]
-        best, strength = peaks[0], evidence_ratio(said[0])
-        apart = [evidence_ratio(said[0] - other) for other in said[1:]]
-        chance = len(self.lags) * len(self._drifts()) * math.exp(-(max(strength, 0.0) ** 2) / 2)
-        rivals = sum(math.exp(-(max(value, 0.0) ** 2) / 2) for value in apart)
-        fit = SoundFit(self, best)
-        close = [one for one, value in zip(peaks[1:], apart, strict=True) if value < MIN_EVIDENCE_OVER_PEAK]
-        limits = self._limits(best, chance, close)
+        figures, model = self.figures(peaks, said), decision_model()
+        confidence = (1 - REPLAY_PROBABILITY) * model.probability(figures)
+        fit = SoundFit(self, peaks[0])
+        notices = (Notice(SoundNotice.SYSTEMATIC, SYSTEMATIC_SIGMA_SECONDS, {"metres": DISTANCE_SIGMA_METRES}),)
+        if confidence < 1 - risk:
+            notices = (self._refusal(peaks, model.against(figures)),)
         scores, _ = self.lag_scores
-        lags = self.lags * STEP_SECONDS + self.between
-        kept = _thin(lags, scores, MAX_CURVE_POINTS)
+        kept = _thin(self.lags * STEP_SECONDS + self.between, scores, MAX_CURVE_POINTS)
         return Shift(
             offset=fit.offset,
-            sigma=math.sqrt(fit.sigma**2 + (DISTANCE_SIGMA_METRES / SPEED_OF_SOUND) ** 2 + LATENCY_SIGMA_SECONDS**2),
+            sigma=fit.sigma,
             rate=fit.rate,
             rate_sigma=fit.rate_sigma,
-            confidence=1 / (1 + chance + rivals),
+            confidence=confidence,
             peaks=torch.tensor([[self.seconds(one, fit.center), one.score] for one in peaks], dtype=torch.float64),
             method="sound",
             fps=fps,
             center=fit.center,
             lags=torch.from_numpy(kept[0]),
             scores=torch.from_numpy(kept[1]),
-            status=status_from(limits),
-            notices=limits,
+            status=status_from(notices),
+            notices=notices,
         )
 
-    def _limits(self, best: SoundPeak, chance: float, rivals: list[SoundPeak]) -> tuple[Notice, ...]:
-        """Why the best shift is not to be believed."""
-        if chance > MAX_CHANCE:
-            return (Notice(SoundNotice.NOTHING, self.seconds(best)),)
-        if rivals:
-            said = ", ".join(f"{self.seconds(one):+.3f}" for one in rivals[:3])
-            return (Notice(SoundNotice.REPEATED, self.seconds(best), {"rivals": said}),)
-        return ()
+    def _refusal(self, peaks: list[SoundPeak], against: list[str]) -> Notice:
+        """Why the best shift is not to be believed. against: names of figures, the most harmful one first."""
+        code = SoundNotice.NOTHING
+        if against[:1] == ["coherence"]:
+            code = SoundNotice.DIFFERENT
+        elif "repetition" in against and len(peaks) > 1:  # rivals are of the sound, not of chance
+            code = SoundNotice.REPEATED
+        said = ", ".join(f"{self.seconds(one):+.3f}" for one in peaks[1:4])
+        return Notice(code, self.seconds(peaks[0]), {"rivals": said})
 
     def seconds(self, peak: SoundPeak, center: float | None = None) -> float:
         """Between the clocks at a shift, in the middle of a or at a time of a's."""
         away = 0.0 if center is None else (center - self.a.first) / STEP_SECONDS - self.middle
         return (peak.lag + peak.drift * away) * STEP_SECONDS + self.between
+
+
+def stretch_sums(products: Floats) -> Floats:
+    """Sums over the frames of each short stretch. products ``(n,)``."""
+    size = max(1, round(STRETCH_SECONDS / STEP_SECONDS))
+    whole = np.pad(products, (0, -len(products) % size))
+    return np.asarray(whole.reshape(-1, size).sum(axis=1), dtype=np.float64)
 
 
 def evidence_ratio(values: Floats) -> float:
@@ -447,19 +334,26 @@ SCORE_SMOOTHING_SECONDS = 0.003  # Standard deviation of the kernel of scores ab
 MIN_SECONDS_FOR_RATE = 30.0  # Overlap from which a rate is estimated: 1e-4 moves the ends by 3 ms then.
 SIGNIFICANCE_SIGMAS = 3.0  # Significant difference of a rate from 1, and of two witnesses.
 MAX_NEWTON_STEPS = 8  # Newton's steps.
+# A room moves the peak at all moments alike; by how much, its width tells: so many seconds at 5 ms, growing with its third power
+# (of the powers 0 to 4 the likeliest in experiments.synchronization.sound).
+ROOM_SIGMA_SECONDS = 0.001
+ROOM_PEAK_WIDTH_SECONDS = 0.005
 
 
 class SoundFit:
     """Offset and rate about a peak, to a fraction of a millisecond."""
 
     def __init__(self, search: SoundSearch, peak: SoundPeak):
+        from scipy import ndimage
+
         self.search = search
         a, b = search.a, search.b
         self.between = search.between
         ends = [search.seconds(peak, a.first), search.seconds(peak, a.first + a.seconds)]
         low, high = max(a.first, b.first - ends[0]), min(a.first + a.seconds, b.first + b.seconds - ends[1])
         self.center = (low + high) / 2
-        self.times, self.curves = self._pieces(peak, low, high)
+        self.times, curves = self._pieces(peak, low, high)
+        self.splines = ndimage.spline_filter(curves, order=3, mode="mirror")
         long = search.free and high - low >= MIN_SECONDS_FOR_RATE
         place, slope, covariance = self._maximize(peak.drift, free=long)
         if long and abs(slope) <= SIGNIFICANCE_SIGMAS * math.sqrt(covariance[1, 1]):  # nothing speaks for a drift
@@ -494,19 +388,19 @@ class SoundFit:
             curves.append(ndimage.gaussian_filter1d(found[: 2 * reach + 1], SCORE_SMOOTHING_SECONDS / HOP_SECONDS))
         return np.array(times), np.array(curves, dtype=np.float64)
 
-    def _scores_along(self, place: float, slope: float) -> tuple[Floats, Floats, Floats]:
-        """Score, slope and curvature of every piece's curve where offset and drift put it."""
+    def _scores(self, place: float, slope: float, away: float = 0.0) -> Floats:
+        """``(p,)`` of every piece's curve where offset and drift put it, or some steps beside."""
         from scipy import ndimage
 
-        at = (place - self._whole + slope * self.times) / HOP_SECONDS + (self.curves.shape[1] - 1) / 2
-        rows = np.arange(len(at))
-        values = [ndimage.map_coordinates(self.curves, [rows, at + off], order=3, mode="nearest") for off in (-1.0, 0.0, 1.0)]
-        before, here, after = values
-        return here, (after - before) / (2 * HOP_SECONDS), (after - 2 * here + before) / HOP_SECONDS**2
+        last = self.splines.shape[1] - 1
+        at = (place - self._whole + slope * self.times) / HOP_SECONDS + last / 2 + away
+        places = [np.arange(len(at)), at.clip(0, last)]
+        return np.asarray(ndimage.map_coordinates(self.splines, places, order=3, mode="mirror", prefilter=False))
 
     def _derivatives(self, found: Floats, both: int) -> tuple[Floats, Floats, Floats]:
         """``(p,)`` scores of the pieces, their slopes ``(p, both)`` in seconds and drift, and the negative Hessian of the sum."""
-        here, first, second = self._scores_along(float(found[0]), float(found[1]))
+        before, here, after = (self._scores(float(found[0]), float(found[1]), away) for away in (-1.0, 0.0, 1.0))
+        first, second = (after - before) / (2 * HOP_SECONDS), (after - 2 * here + before) / HOP_SECONDS**2
         design = np.stack([np.ones_like(self.times), self.times], axis=1)[:, :both]
         return here, design * first[:, None], -(design * second[:, None]).T @ design
 
@@ -517,7 +411,7 @@ class SoundFit:
         half = max(float(np.abs(self.times).max()), HOP_SECONDS)
         near = min(MAX_RATE_DEVIATION, 2 * STEP_SECONDS / half)  # what the search before could not tell apart
         steps = drift + np.arange(-near, near + 1e-12, HOP_SECONDS / half) if free else np.array([drift])
-        totals = [[float(self._scores_along(place, slope)[0].sum()) for place in places.tolist()] for slope in steps.tolist()]
+        totals = [[float(self._scores(place, slope).sum()) for place in places.tolist()] for slope in steps.tolist()]
         row, column = np.unravel_index(int(np.argmax(totals)), np.shape(totals))
         found = np.array([places[column], steps[row]])
         both = 2 if free else 1
@@ -528,25 +422,33 @@ class SoundFit:
             move = np.zeros(2)
             move[:both] = np.linalg.solve(hessian, slopes.sum(axis=0))
             next_place, next_slope = (found + move).tolist()
-            if self._scores_along(next_place, next_slope)[0].sum() < here.sum():
+            if self._scores(next_place, next_slope).sum() < here.sum():
                 break
             found = found + move
         return float(found[0]), float(found[1]), self._covariance(found, both)
 
     def _covariance(self, found: Floats, both: int) -> Floats:
         """``(2, 2)`` of seconds and drift."""
-        _, slopes, hessian = self._derivatives(found, both)
+        here, slopes, hessian = self._derivatives(found, both)
         covariance = np.zeros((2, 2))
         covariance[0, 0] = MIN_PEAK_SEPARATION_SECONDS**2
         if np.linalg.eigvalsh(hessian).min() > 0:
             inverse = np.linalg.inv(hessian)
             covariance[:both, :both] = inverse @ (slopes.T @ slopes) @ inverse * len(slopes) / max(1, len(slopes) - both)
-        covariance[0, 0] += (HOP_SECONDS / math.sqrt(12)) ** 2
+            width = math.sqrt(max(0.0, float(here.sum())) / hessian[0, 0])
+            room = ROOM_SIGMA_SECONDS * (width / ROOM_PEAK_WIDTH_SECONDS) ** 3
+            covariance[0, 0] += min(room, MIN_PEAK_SEPARATION_SECONDS) ** 2
         return covariance
 
 
 # ----------------------------------------------------------------------------------------------------------------------
 # A witness to what keypoints or pixels say.
+
+
+DISTANCE_SIGMA_METRES = 3.0  # How much nearer the sound is to one camera.
+SPEED_OF_SOUND = 343.0  # Metres per second at 20 degrees.
+LATENCY_SIGMA_SECONDS = 0.015  # Between sound and pictures of a file: three sigmas are the 45 ms of ITU-R BT.1359-1.
+SYSTEMATIC_SIGMA_SECONDS = math.hypot(DISTANCE_SIGMA_METRES / SPEED_OF_SOUND, LATENCY_SIGMA_SECONDS)
 
 
 def offset_difference(one: Shift, other: Shift) -> float:
@@ -555,18 +457,22 @@ def offset_difference(one: Shift, other: Shift) -> float:
 
 
 def check_by_sound(found: Shift, heard: Shift) -> Shift:
-    """What keypoints or pixels say, with what the sound says to it: it agrees, contradicts (a refusal), or does not decide."""
+    """What keypoints or pixels say, with what the sound says to it: it agrees (the odds of both are multiplied), contradicts (a
+    refusal), or does not decide."""
     if not heard.ok:
         if all(notice.code is SoundNotice.NONE for notice in heard.notices):
             return found
         why = next((notice.text for notice in heard.notices if notice.code.refuses is not None), heard.reason)
         return dataclasses.replace(found, notices=(*found.notices, Notice(SoundNotice.OPEN, 0.0, {"why": why})))
-    said = {"offset": f"{heard.at(heard.center) - heard.center:+.3f}", "sigma": f"{heard.sigma:.3f}"}
+    sigma = math.hypot(heard.sigma, SYSTEMATIC_SIGMA_SECONDS)
+    said = {"offset": f"{heard.at(heard.center) - heard.center:+.3f}", "sigma": f"{sigma:.3f}"}
     if not found.ok:
         return dataclasses.replace(found, notices=(*found.notices, Notice(SoundNotice.ALONE, 0.0, said)))
     off = offset_difference(found, heard)
-    if abs(off) <= SIGNIFICANCE_SIGMAS * math.hypot(found.sigma, heard.sigma):
-        return dataclasses.replace(found, notices=(*found.notices, Notice(SoundNotice.AGREES, off)))
+    if abs(off) <= SIGNIFICANCE_SIGMAS * math.hypot(found.sigma, sigma):
+        right, wrong = found.confidence * heard.confidence, (1 - found.confidence) * (1 - heard.confidence)
+        notices = (*found.notices, Notice(SoundNotice.AGREES, off))
+        return dataclasses.replace(found, confidence=right / (right + wrong), notices=notices)
     said["found"] = f"{found.at(found.center) - found.center:+.3f}"
     said["own"] = f"{found.sigma:.3f}"
     limits = (Notice(SoundNotice.CONTRADICTS, off, said), *found.notices)

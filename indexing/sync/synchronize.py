@@ -38,7 +38,8 @@ from indexing.sync.recordings import (
     take_of,
     undecided_shift,
 )
-from indexing.sync.sound import SoundNotice, check_by_sound, read_sound, sound_shift
+from indexing.sync.sound import SoundNotice, check_by_sound, sound_shift
+from indexing.sync.soundtrack import read_sound
 from indexing.video import Chunk, read_video, track_points
 
 Method = Literal["auto", "keypoints", "tracks", "brightness", "sound"]
@@ -209,7 +210,7 @@ def _compare(
 
 def compare_sound(a: Take, b: Take, **more: Any) -> Shift:
     """What the sound of two cameras says."""
-    known = {name: value for name, value in more.items() if name in ("max_shift", "rate")}
+    known = {name: value for name, value in more.items() if name in ("max_shift", "rate", "risk")}
     sounds = [None if take.footage is None else read_sound(take.footage) for take in (a, b)]
     return sound_shift(sounds[0], sounds[1], fps=(a.fps, b.fps), **known)
 
