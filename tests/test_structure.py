@@ -17,9 +17,9 @@ MAX_FIELDS = 12
 """Fields of the options of one verb."""
 BOUNDS = {
     "files": 350,
-    "lines": 94_598,
-    "code lines": 58_605,
-    "docstring lines": 14_437,
+    "lines": 94_815,
+    "code lines": 58_748,
+    "docstring lines": 14_464,
     "option fields": 111,
     "option fields that nobody sets": 0,
     "functions called by an everyday word": 2,
@@ -27,7 +27,7 @@ BOUNDS = {
     "circles of imports": 0,
     "circles of imports, those for types too": 0,
     "lines of experiments": 19_096,
-    "lines of tests": 54_427,
+    "lines of tests": 54_567,
 }
 """What each figure may be at most."""
 

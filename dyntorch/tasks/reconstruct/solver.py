@@ -334,7 +334,10 @@ LABEL_COST = 0.2  # of a point of two bodies: 0 takes one plane for two bodies i
 
 
 def penalized_cost(tracks: ViewTracks, fit: LiftedFit, sigma: Tensor) -> Tensor:
-    """The penalized cost ``(b,)`` of one model; where it failed, that of outliers only."""
+    """The penalized cost ``(b,)`` of one model; where it failed, that of outliers only.
+
+    Torr's criterion: -2 log of the posterior, with the logarithms of BIC for points and cameras and robust squares over one noise
+    that all models share.  One figure decides, and differences of it are log odds: other figures would count the data twice."""
     motion, seen = fit.motion, tracks.weights > 0
     r = seen.sum(1).to(sigma.dtype) * motion.sensor
     free = motion.k - (motion.bodies > 1)
