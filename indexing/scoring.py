@@ -8,12 +8,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import stdtrit
 from torch import Tensor
 
 Array = NDArray[Any]
 
 
 SHARPNESS = 2.0  # of the softmax over standardized scores: leave-one-out likelihood peaks between 1.5 and 2.5 on UTKinect
+SHARPNESS_RANGE, NUM_HALVINGS = (1e-3, 1e4), 60  # within which the sharpness of a row is looked for, the interval halved so often
 MIN_EVENT_SECONDS = 0.4  # shorter finds are flicker
 MAX_GAP_SECONDS = 0.5  # between two finds of one class, which are then one
 
@@ -43,12 +45,32 @@ def probabilities(scores: Array, sharpness: float = SHARPNESS) -> Array:
     return np.asarray(odds / odds.sum(axis=1, keepdims=True))
 
 
+def sharpen(scores: Array, sure: Array) -> Array:
+    """``(N, classes)`` softmax of the scores, each row as sharp as it must be for its best class to be as likely as ``sure``
+    ``(N,)``, or as all others where that is less."""
+    below = scores - scores.max(axis=1, keepdims=True)
+    below = below / np.maximum(-below.mean(axis=1, keepdims=True), 1e-9)
+    low, high = (np.full((len(scores), 1), end) for end in SHARPNESS_RANGE)
+    for _ in range(NUM_HALVINGS):
+        middle = (low + high) / 2
+        likely = 1 / np.exp(middle * below).sum(axis=1, keepdims=True)
+        low, high = np.where(likely < sure[:, None], middle, low), np.where(likely < sure[:, None], high, middle)
+    odds = np.exp(high * below)
+    return np.asarray(odds / odds.sum(axis=1, keepdims=True))
+
+
 def reject_threshold(reject: float | None, wrong: Tensor, classes: int | None = None) -> float | None:
-    """The least evidence that is accepted. wrong ``(N,)``."""
+    r"""The least evidence that is accepted: what wrong evidence ``(N,)`` exceeds at a rate.
+
+    Of few ``classes`` that it was learned from no quantile of a low rate can be counted, and the rate is that of the next class:
+    :math:`\mu + \sigma \sqrt{1 + 1/C}\, t_{C-1}(1 - r)`, the upper end of Student's prediction interval.
+    """
     if reject is None or not 0 < reject < 1:
         return reject
-    level = (1 - reject) * (1 if classes is None else (classes + 1) / classes)
-    return float(np.quantile(wrong.cpu().numpy(), min(1.0, level)))
+    values = wrong.cpu().numpy().astype(float)
+    if classes is None:
+        return float(np.quantile(values, 1 - reject))
+    return float(values.mean() + values.std() * np.sqrt(1 + 1 / classes) * stdtrit(max(classes - 1, 1), 1 - reject))
 
 
 def event_levels(wrong: Array, rate: float, extent: float, least: tuple[float, float]) -> tuple[float, float]:

@@ -21,6 +21,7 @@ _HOME = {
     **dict.fromkeys(("one_thread", "map_blocks"), "dyntorch.numerics.blocks"),
     **dict.fromkeys(("on_cpu", "check_options"), "dyntorch.numerics.arguments"),
     "native": "dyntorch.native.library",
+    "DecisionModel": "dyntorch.numerics.logistic",
     **dict.fromkeys(("native_correlations", "native_deviations", "native_residuals"), "dyntorch.native.recognition"),
     **dict.fromkeys(("canonical_correlation", "orthonormal_basis"), "dyntorch.numerics.subspaces"),
     **dict.fromkeys(("affine_factorization", "metric_upgrade"), "dyntorch.numerics.subspaces"),

@@ -62,6 +62,17 @@ def test_reject_threshold():
     assert reject_threshold(None, wrong) is None
     assert reject_threshold(0.1, wrong) == pytest.approx(90)
     assert reject_threshold(-3.5, wrong) == -3.5 and reject_threshold(7, wrong) == 7
-    # the rate of the next unknown action counts classes
-    assert reject_threshold(0.1, wrong[:100], 19) == pytest.approx(99 * 0.9 * 20 / 19)
-    assert reject_threshold(0.1, wrong[:100], 5) == 99.0 and reject_threshold(-2.0, wrong, 5) == -2.0
+    assert reject_threshold(-2.0, wrong, 5) == -2.0
+
+
+def test_a_rate_is_that_of_the_next_class_however_few_it_was_learned_from():
+    rng = np.random.default_rng(0)
+    for classes in (4, 12):
+        levels = rng.normal(size=(1000, classes + 1))
+        for rate in (0.02, 0.1, 0.3):
+            passed = [
+                last >= reject_threshold(rate, torch.from_numpy(some), classes)
+                for *some_, last in levels
+                for some in [np.array(some_)]
+            ]
+            assert np.mean(passed) == pytest.approx(rate, abs=0.04), (classes, rate)
