@@ -24,6 +24,7 @@ from indexing.action.background import (
     segment_evidence,
 )
 from indexing.action.bank import Windows
+from indexing.action.confidence import class_probabilities
 from indexing.action.exemplars import (
     CROPS,
     MAX_WINDOWS,
@@ -46,7 +47,7 @@ from indexing.modelfile import Parts, labels_from_json, labels_to_json, skeleton
 from indexing.modelfile import read_integer as whole_number
 from indexing.recordings.decoding import Explanation, Withheld, decode
 from indexing.recordings.live import ActionStream, LiveSource
-from indexing.scoring import Event, join_labels, probabilities, refuse, reject_threshold, same_label
+from indexing.scoring import Event, join_labels, refuse, reject_threshold, same_label
 from indexing.skeleton import Skeleton
 from indexing.windows import concatenate_clips, repair_clip, resample_clips
 
@@ -400,13 +401,13 @@ class ActionIndexer(SavedClassifier):
 
     @one_thread
     def predict_proba(self, clips: Iterable[Any]) -> Array:
-        """``(clips, classes)`` probabilities of the known classes, rows sum to 1 (a softmax of the standardized scores).
+        """``(clips, classes)`` probabilities of the known classes, rows sum to 1; the best is that of :meth:`decision_function`.
 
-        With ``weights="learned"`` its sharpness is the one that made left-out people's answers most likely.  Where there is a
-        background, what is missing to 1 is its probability.
+        A softmax of the scores that is as sharp as answers were right, of other people, from other sides and badly seen, whose
+        best class stood as far above the next one (:mod:`indexing.action.confidence`).  Where there is a background, what is
+        missing to 1 is its probability.
         """
-        scores = np.asarray(self._model().scores(self._queries(clips)).cpu().numpy())
-        return probabilities(scores, self.model_.blend.sharpness)[:, : len(self.classes_)]
+        return class_probabilities(self._model(), self._queries(clips))[:, : len(self.classes_)]
 
     @one_thread
     def predict(self, clips: Iterable[Any]) -> Array:

@@ -26,7 +26,6 @@ from indexing.action.model import (
     mirror_some,
     standardize,
 )
-from indexing.scoring import SHARPNESS
 
 MIN_MUTUAL_SHARE = 0.5  # of the mirror images of two classes that are nearest to the other one: neither is mirrored then
 HUB_SHARE = 0.5  # of an exemplar's closeness to other classes that is taken off: +2..3 %, one shot +4 %
@@ -36,7 +35,6 @@ MAX_TRAINING_ROWS = 3000  # the fit of the kernel machine grows with their squar
 MAX_TRAINING_ROWS_SOLID = 5000  # the same where exemplars have depth: true views are worth more
 NEAREST_WEIGHT_SOLID = 0.5  # the same for exemplars with depth: B then sees true views (1.5: -1.5 % on Florence3D)
 BLENDS = ((1.0, 0.0), (1.0, 0.25), (1.0, 0.5), (1.0, 1.0), (1.0, 1.5), (1.0, 3.0), (0.0, 1.0))  # weights of B and A that are tried
-SHARPNESSES = tuple(float(2 ** (k / 4)) for k in range(-4, 17))  # that are tried: .5 to 16
 MIN_EXAMPLES_TO_BLEND = 8  # per class; from 5 on it costs 1 to 2 % on UTKinect
 MAX_FOLDS = 5  # groups of people whose machines are trained
 NUM_QUERY_VIEWS = 4  # virtual views that ask per exemplar, besides the image itself
@@ -51,8 +49,8 @@ IMPORTANCE_RIDGE = 1.0  # of the regression on 0/1 masks, in masks: matters only
 # How the scorers are weighed, learned from people who were left out: once over the whole set, whatever its actions are.
 #
 # Every exemplar, as it was seen and in its virtual views, is asked of what was learned from the other people.  The blend with the
-# fewest mistakes is taken, and the sharpness that makes the answers most likely.  Asked of other clips of the same person, every
-# scorer looks perfect and nothing is learned (UTKinect .939 against .953 without): so groups must be known.
+# fewest mistakes is taken.  Asked of other clips of the same person, every scorer looks perfect and nothing is learned (UTKinect
+# .939 against .953 without): so groups must be known.
 
 
 def leave_out(groups: Tensor) -> Tensor:
@@ -70,29 +68,22 @@ class Trained:
     gram: Tensor
 
 
-def learn_blend(model: ShapeModel, groups: Tensor, trained: Trained | None) -> Blend:
+def learn_blend(model: ShapeModel, groups: Tensor, trained: Trained) -> Blend:
     """The blend that serves people best who were left out. groups ``(N,)``."""
     labels, folds = model.labels, leave_out(groups)
     # only those are asked whose action somebody in another fold performs, too
     usable = ((folds[:, None] != folds[None]) & (labels[:, None] == labels[None])).any(dim=1)
-    if int(folds.max()) < 1 or not bool(usable.any()):
+    few = int(torch.bincount(labels).median()) < MIN_EXAMPLES_TO_BLEND
+    if few or int(folds.max()) < 1 or not bool(usable.any()):
         return model.blend
     asked = asked_views(model)
     views = []
     for windows in asked:
-        found = []
-        if trained is not None:
-            found.append(_machine_out(model, trained, windows, folds))
-        if model.scorer != "kernel":
-            found.append(_out(model.residuals(windows), model, folds))
+        found = _machine_out(model, trained, windows, folds), _out(model.residuals(windows), model, folds)
         views.append(torch.stack([standardize(scores) for scores in found]))
     evidence = torch.cat([view[:, usable] for view in views], dim=1).double()
     truth = labels[usable].repeat(len(asked))
-    if model.scorer != "both":
-        return _fit_sharpness(model.blend, evidence[0], truth, int(usable.sum()))
-    few = int(torch.bincount(labels).median()) < MIN_EXAMPLES_TO_BLEND
-    blend = model.blend if few else _fewest_mistakes(evidence, truth, model.blend)
-    return _fit_sharpness(blend, blend_scores(evidence, blend), truth, int(usable.sum()))
+    return _fewest_mistakes(evidence, truth, model.blend)
 
 
 def _out(residuals: Tensor, model: ShapeModel, folds: Tensor) -> Tensor:
@@ -157,18 +148,6 @@ def _fewest_mistakes(evidence: Tensor, truth: Tensor, prior: Blend) -> Blend:
     return chosen
 
 
-def _fit_sharpness(blend: Blend, scores: Tensor, truth: Tensor, exemplars: int) -> Blend:
-    """The blend with the sharpness that makes the answers most likely, were one more of the exemplars asked a mistake."""
-    even, count = standardize(scores), scores.shape[1]
-    doubt = 1 / (exemplars + 2)
-    losses = []
-    for sharp in SHARPNESSES:
-        chance = torch.log_softmax(sharp * even, dim=1)
-        right = chance.gather(1, truth[:, None])[:, 0]
-        losses.append(-float((1 - doubt) * right.mean() + doubt * chance.mean() * count / max(count - 1, 1)))
-    return dataclasses.replace(blend, sharpness=SHARPNESSES[int(np.argmin(losses))])
-
-
 @dataclass(frozen=True)
 class Lesson:
     """How to learn. groups ``(N,)``."""
@@ -191,9 +170,7 @@ def learn(exemplars: Exemplars, labels: Tensor, classes: int, lesson: Lesson) ->
     model = ShapeModel(
         exemplars, labels, classes, lesson.view, lesson.scorer, metric, lesson.symmetry, none,
         nothing, torch.zeros_like(exemplars.owner, dtype=nothing.dtype), None, None, None,
-        blend=Blend(
-            nearest=share * NEAREST_WEIGHT_SOLID + (1 - share) * NEAREST_WEIGHT, sharpness=SHARPNESS
-        ),
+        blend=Blend(nearest=share * NEAREST_WEIGHT_SOLID + (1 - share) * NEAREST_WEIGHT),
         hidden=lesson.hidden,
     )  # fmt: skip
     asked = asked_exemplars(labels)
@@ -208,7 +185,7 @@ def learn(exemplars: Exemplars, labels: Tensor, classes: int, lesson: Lesson) ->
     trained = None
     if lesson.scorer != "nearest":
         model, trained = _with_machine(model, one_side=lesson.view == "same")
-    if lesson.learned and lesson.groups is not None:
+    if lesson.learned and lesson.groups is not None and trained is not None and lesson.scorer == "both":
         model = dataclasses.replace(model, blend=learn_blend(model, lesson.groups, trained))
     return _with_evidence(model, originals, asked)
 

@@ -39,7 +39,6 @@ from indexing.action.joint_weights import MAX_WEIGHT, JointWeights
 from indexing.action.kernels import Kernels
 from indexing.modelfile import Parts, number, part, read_fields, store
 from indexing.opening import quote
-from indexing.scoring import SHARPNESS
 
 TURNED_CARD_WEIGHT = 0.3  # one shot +1.3 %, Florence3D +.8 %; .6 is too much
 NUM_NEIGHBOURS = 2  # exemplars per class that are averaged (1: -1 %)
@@ -154,11 +153,10 @@ MOMENT_TERMS = ("epi", "nn")  # on short windows what is bound to the view helps
 
 @dataclass(frozen=True)
 class Blend:
-    """How much each scorer counts once it is standardized over the classes of a query, and how sure the sum is."""
+    """How much each scorer counts once it is standardized over the classes of a query."""
 
     kernel: float = 1.0
     nearest: float = NEAREST_WEIGHT
-    sharpness: float = SHARPNESS
 
 
 class Cache:
@@ -418,7 +416,7 @@ def read_shape_model(
         counts = stored_fields["machine"].counts
         if int(counts.sum()) != sizes["rows"]:
             raise ValueError(f"machine.counts: {int(counts.sum())} support vectors, and {sizes['rows']} are there")
-    blend = {name: number(value, name, 0, MAX_WEIGHT) for name, value in header["blend"].items()}
+    blend = {name: number(value, name, 0, MAX_WEIGHT) for name, value in header["blend"].items() if name != "sharpness"}
     weights = stored_fields["joint_weights"]
     if weights is not None and not weights.is_usable:
         raise ValueError("parts: no joint or no channel counts")

@@ -202,7 +202,7 @@ def compare_parts(indexer: ActionIndexer, windows: Windows) -> tuple[Array, Arra
     """``(N, classes)`` probabilities, ``(N,)`` residual to the nearest example, ``(N, N)`` residuals between parts, and how
     far examples of different actions are apart, which is far."""
     model = indexer.model_
-    likely = probabilities(model.scores(windows).cpu().numpy(), model.blend.sharpness)
+    likely = probabilities(model.scores(windows).cpu().numpy())
     exemplars = model.exemplars.crop(0)
     everything = stack([exemplars, windows])
     copies = [Copy(everything)]

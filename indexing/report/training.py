@@ -334,6 +334,6 @@ def _metrics(indexer: ActionIndexer, parts: BodyParts) -> dict[str, Any]:
         "actions": [str(label) for label in parts.classes],
         "joints": list(joints),
         "importance": parts.importance.tolist(),
-        "blend": {"kernel": blend.kernel, "nearest": blend.nearest, "sharpness": blend.sharpness},
+        "blend": {"kernel": blend.kernel, "nearest": blend.nearest},
         "joint_weights_learned": indexer.model_.joint_weights is not None,
     }

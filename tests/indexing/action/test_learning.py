@@ -9,10 +9,9 @@ import torch
 from indexing import ActionIndexer
 from indexing.action import learning
 from indexing.action.bank import EPSILON, JointMetric, factorize, flatten_channel, fuse_terms
-from indexing.action.learning import BLENDS, _fewest_mistakes, _fit_sharpness, leave_out
+from indexing.action.learning import BLENDS, _fewest_mistakes, leave_out
 from indexing.action.model import Blend, ShapeModel, evidence
 from indexing.actors import Person, dataset
-from indexing.scoring import probabilities
 
 ACTIONS = ("squat", "wave", "kick", "bow", "punch")
 
@@ -47,23 +46,6 @@ def test_the_scorer_that_is_right_is_chosen():
     same = _fewest_mistakes(torch.stack([right, right]), truth, Blend())
     assert (same.kernel, same.nearest) == (1.0, Blend().nearest)  # nothing gained, nothing changed
     assert (Blend().kernel, Blend().nearest) in BLENDS
-
-
-def test_sharpness_is_the_likeliest():
-    draw = torch.Generator().manual_seed(1)
-    truth = torch.arange(4).repeat(50)
-    scores = torch.nn.functional.one_hot(truth, 4).double() + torch.randn(200, 4, generator=draw, dtype=torch.float64)
-    found = _fit_sharpness(Blend(), scores, truth, 10**6).sharpness
-
-    def likelihood(sharpness):
-        chance = probabilities(scores.numpy(), sharpness)
-        return np.log(chance[np.arange(200), truth.numpy()]).mean()
-
-    assert likelihood(found) >= max(likelihood(found * 1.19), likelihood(found / 1.19))
-    assert likelihood(found) > likelihood(8.0)
-    certain = 5.0 * torch.nn.functional.one_hot(truth, 4).double()  # nobody was ever wrong: the fewer asked, the less it says
-    few, many = (_fit_sharpness(Blend(), certain, truth, exemplars).sharpness for exemplars in (8, 800))
-    assert few < many < 16
 
 
 @pytest.mark.slow
