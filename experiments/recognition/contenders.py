@@ -20,7 +20,7 @@ from indexing.action.model import ShapeModel
 from indexing.recordings import decoding
 from indexing.scoring import Event
 
-Part = Literal["short windows", "whole exemplars", "kernel machine", "durations", "priors", "rest", "background", "verification"]
+Part = Literal["short windows", "whole exemplars", "kernel machine", "durations", "priors", "rest", "background"]
 Method = Literal["equal", "learned", "unrepaired", "windows", "image", "dtw"]
 NAMES: dict[Method, str] = {
     "equal": "ours",
@@ -33,9 +33,8 @@ NAMES: dict[Method, str] = {
 OPTIONS: dict[Method, dict[str, Any]] = {"equal": {}, "learned": {"weights": "learned"}, "unrepaired": {"repair": False}}
 
 
-EVERYTHING = -1e9  # ``reject``: events of any score are told
-# what the decoding of a recording is without one of its parts: options, a constant of it, or ``reject``
-WITHOUT: dict[Part, ActionOptions | tuple[str, float] | float] = {
+# what the decoding of a recording is without one of its parts: options, or a constant of it
+WITHOUT: dict[Part, ActionOptions | tuple[str, float]] = {
     "short windows": ("MOMENT_WEIGHT", 0.0),
     "whole exemplars": ("WHOLE_WEIGHT", 0.0),
     "kernel machine": ("MACHINE_WEIGHT", 0.0),
@@ -43,7 +42,6 @@ WITHOUT: dict[Part, ActionOptions | tuple[str, float] | float] = {
     "priors": ("DURATION_WEIGHT", 0.0),
     "rest": ActionOptions(rest_weight=0.0),
     "background": ActionOptions(min_quality=-100.0),
-    "verification": EVERYTHING,
 }
 
 
@@ -67,8 +65,6 @@ def sliding(method: Method, seed: int = 0, without: Part | None = None) -> Actio
     change = None if without is None else WITHOUT[without]
     if isinstance(change, tuple):
         return WithoutPart(ActionIndexer(random_state=seed, **OPTIONS[method]), *change)
-    if isinstance(change, float):
-        return ActionIndexer(random_state=seed, reject=change, **OPTIONS[method])
     return ActionIndexer(random_state=seed, options=change, **OPTIONS[method])
 
 
@@ -141,9 +137,7 @@ class Sliding:
 
     def fit(self, clips: Sequence[Clip], labels: Array) -> Self:
         """Keep the exemplars' short windows."""
-        self.indexer = ActionIndexer(scorer="nearest", search=False, mirror=False, virtual_views=0, reject=EVERYTHING).fit(
-            clips, labels
-        )
+        self.indexer = ActionIndexer(scorer="nearest", search=False, mirror=False, virtual_views=0).fit(clips, labels)
         model = self.indexer.model_
         same = {field.name: getattr(model, field.name) for field in dataclasses.fields(model) if field.init}
         bank = self.nearest.describe(model.exemplars.moments.values)

@@ -8,10 +8,9 @@ chance that a clip of a learned class has more evidence than one of a class held
 camera, so it must be comparable between them.  Then ``reject`` asks for rates of false alarms: the share of unknown clips that are
 taken for a known action is what one got, beside the share of known clips that are answered, and answered rightly.
 Evidence of the baselines is minus the distance to the nearest exemplar; "best probability" is the largest of ``predict_proba``,
-as people take it from a softmax.  *Other movement*: pieces of takes of :mod:`experiments.recognition.other_movement`.  The other
-ways (a to e) are those of :mod:`experiments.recognition.novelty`; ours is e with the profiles of both scorers.  How the threshold
-is calibrated was chosen on UTKinect and Florence3D (leave-class-out among the exemplars), so rates on them are, if anything, too
-good; the weight of the profiles is on a plateau of both.
+as people take it from a softmax.  The other ways (a to e) are those of :mod:`experiments.recognition.novelty`; ours is e with the
+profiles of both scorers.  How the threshold is calibrated was chosen on UTKinect and Florence3D (leave-class-out among the
+exemplars), so rates on them are, if anything, too good; the weight of the profiles is on a plateau of both.
 """
 
 from __future__ import annotations
@@ -27,14 +26,11 @@ from experiments.common.runner import BaseConfig, Grid, Tables, experiment
 from experiments.common.tables import note
 from experiments.recognition import protocol
 from experiments.recognition.contenders import NAMES, OPTIONS, Method, check_methods, contender
-from experiments.recognition.novelty import named, ways
-from experiments.recognition.other_movement import ALIKE, takes_of_others, within_room
+from experiments.recognition.novelty import ways
 from experiments.recognition.protocol import Array, Rendered
-from indexing import Clip, ClipSet
-from indexing.joints import match_joints
+from indexing import Clip
 
 FOLDS = 5
-PIECES = 60  # of other movement that each model is asked of
 NONE = "(none)"
 
 
@@ -60,13 +56,11 @@ class Config(BaseConfig):
 
 @dataclass
 class Answers:
-    """Of all queries of one method and camera: evidence by its name, whether known, by rate what was answered, also of other
-    movement."""
+    """Of all queries of one method and camera: evidence by its name, whether known, and by rate what was answered."""
 
     known: list[bool]
     right: dict[float, list[bool]]
     accepted: dict[float, list[bool]]
-    others: dict[float, list[bool]]
     evidence: dict[str, list[float]]
 
 
@@ -94,10 +88,9 @@ def evidences(
 
 
 def fold(
-    rendered: Rendered, train: Array, test: Array, method: Method, seed: int, config: Config, name: str, into: dict[int, Answers],
-    strange: dict[int, list[Clip]],
-) -> None:  # fmt: skip
-    """Learn from some clips, ask about others, and add what was said, by azimuth; name: of the set; strange: other movement."""
+    rendered: Rendered, train: Array, test: Array, method: Method, seed: int, config: Config, name: str, into: dict[int, Answers]
+) -> None:
+    """Learn from some clips, ask about others, and add what was said, by azimuth; name: of the set."""
     clips, labels = [rendered.exemplars[i] for i in train], rendered.labels[train]
     learned: Any = contender(method, seed)()
     learned.fit(clips, labels)
@@ -115,7 +108,6 @@ def fold(
             said = np.asarray(learned.predict([rendered.queries[turn][i] for i in test]))
             answers.accepted[rate] += (said != NONE).tolist()
             answers.right[rate] += (said == rendered.labels[test]).tolist()
-            answers.others[rate] += (np.asarray(learned.predict(strange[turn])) != NONE).tolist()
 
 
 def companies(labels: Array, size: int, seed: int) -> list[Array]:
@@ -127,34 +119,15 @@ def companies(labels: Array, size: int, seed: int) -> list[Array]:
 def ask(name: str, method: Method, config: Config) -> dict[int, Answers]:
     """By azimuth, what a method says of all queries: all held out classes, all subjects."""
     clips = protocol.load_set(name)
-
-    def empty() -> dict[float, list[bool]]:
-        return {rate: [] for rate in config.rates}
-
-    into = {turn: Answers([], empty(), empty(), empty(), {}) for turn in config.turns}
+    into = {
+        turn: Answers([], {rate: [] for rate in config.rates}, {rate: [] for rate in config.rates}, {}) for turn in config.turns
+    }
     for seed in range(config.draws):
         rendered = protocol.render(clips, seed, turns=config.turns)
-        strange = pieces(name, clips, seed, config.turns)
         for hidden in companies(rendered.labels, config.held_out, seed):
             for train, test in protocol.leave_one_subject_out(protocol.merged(rendered.subjects, FOLDS)):
-                fold(rendered, train[~np.isin(rendered.labels[train], hidden)], test, method, seed, config, name, into, strange)
+                fold(rendered, train[~np.isin(rendered.labels[train], hidden)], test, method, seed, config, name, into)
     return into
-
-
-def pieces(name: str, clips: ClipSet, seed: int, turns: Sequence[int]) -> dict[int, list[Clip]]:
-    """By azimuth, pieces of takes in which nobody does anything of the set, as long as its clips."""
-    rng, seconds = np.random.default_rng([seed, 3]), float(np.median([clip.duration for clip in clips]))
-    learned = {word for label in np.unique(clips.labels).tolist() for word in (*ALIKE.get(label, ()), label)}
-    found = []
-    for word, take in takes_of_others(name):
-        seen = None if any(part in word for part in learned) else within_room(take)
-        if seen is not None and seen.duration > seconds:
-            start = float(seen.times[0]) + rng.uniform(0.0, seen.duration - seconds)
-            found.append(seen.between(start, start + seconds))
-    like = named(clips[0], name).skeleton
-    kept = [found[i] for i in rng.permutation(len(found))[:PIECES]]
-    views = {turn: [protocol.query_view(one, turn, rng) for one in kept] for turn in turns}
-    return {turn: [match_joints(one, like)[0].replace(skeleton=clips[0].skeleton) for one in some] for turn, some in views.items()}
 
 
 def auroc(answers: Answers) -> dict[str, float]:
@@ -162,16 +135,15 @@ def auroc(answers: Answers) -> dict[str, float]:
     return {name: float(roc_auc_score(answers.known, values)) for name, values in answers.evidence.items()}
 
 
-def rates(answers: Answers, wanted: Sequence[float]) -> list[list[float]]:
-    """By rate: false alarms in unknown actions, in other movement, share of known clips that are accepted, and answered rightly."""
+def rates(answers: Answers, wanted: Sequence[float]) -> list[tuple[float, float, float]]:
+    """By rate: false alarms, share of the known clips that are accepted, and that are answered rightly."""
     known = np.array(answers.known)
     return [
-        [
+        (
             float(np.mean(np.array(answers.accepted[rate])[~known])),
-            float(np.mean(answers.others[rate])),
             float(np.mean(np.array(answers.accepted[rate])[known])),
             float(np.mean(np.array(answers.right[rate])[known])),
-        ]
+        )
         for rate in wanted
     ]
 
@@ -189,9 +161,10 @@ def unknown_actions(name: str, config: Config) -> Tables:
     for method in (method for method in config.methods if method in OPTIONS):
         for turn in config.turns:
             got = rates(found[method][turn], config.rates)
-            lines |= {f"{NAMES[method]}, {turn}°, asked {rate:g}": one for rate, one in zip(config.rates, got, strict=True)}
+            for rate, (alarms, kept, right) in zip(config.rates, got, strict=True):
+                lines[f"{NAMES[method]}, {turn}°, asked {rate:g}"] = [alarms, kept, right]
     if lines:
-        yield f"{name}, false alarms", Grid(["false alarms got", "in other movement", "known accepted", "known right"], lines)
+        yield f"{name}, false alarms", Grid(["false alarms got", "known accepted", "known right"], lines)
 
 
 @experiment(Config(), quick={"sets": ("florence3d",), "methods": ("equal",), "turns": (0,), "ways": False})

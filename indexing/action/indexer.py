@@ -440,7 +440,7 @@ class ActionIndexer(SavedClassifier):
         recording = repair_clip(recording) if self.repair else recording
         model = self._model()
         labels = [*self.classes_.tolist(), *(("background", i) for i in range(model.hidden))]
-        result = decode(model, recording, self._stream(), labels, self.reject, progress)
+        result = decode(model, recording, self._stream(), labels, None if model.hidden else self.reject, progress)
         if model.hidden:
             floor, level = event_level(model, self._rate), self._evidence_level
             result = remove_background(
@@ -479,10 +479,9 @@ class ActionIndexer(SavedClassifier):
 
         The best explanation of the recording as segments: each is worth its resemblance to whole exemplars and to short windows of
         them, by how long it lasts, and must be worth more than no action at all, which is worth more while the person rests.
-        Cyclic actions that touch are one event.  Of several actions those events are told that are more likely right than not,
-        by evidence and by the other events of the recording; in movement of nobody's actions about one an hour is
-        (:mod:`indexing.recordings.verification`).  ``reject`` asks for something else: a rate at which wrong actions may reach
-        an event's score, or, outside 0..1, the least score.
+        Cyclic actions that touch are one event.  ``reject`` asks for more: a rate at which wrong actions may reach an event's
+        score, or, outside 0..1, the least score.  Two or three classes have little to stand out from: add one of ordinary
+        movement.
         """
         return self.scan(clip, progress)[1]
 

@@ -21,7 +21,6 @@ from indexing.action.model import ShapeModel
 from indexing.action.stream import ActionOptions, Progress, Stream, StreamScan, motion_levels, scan, wrong_contrast
 from indexing.clip import Clip
 from indexing.recordings.evidence import MIN_CYCLIC, Array, Durations, Lattice, level, machine_scores, whole_scores
-from indexing.recordings.verification import adapt, figures_of, log_odds
 from indexing.scoring import Event, event_levels
 from indexing.windows import Ragged, concatenate_clips
 
@@ -102,8 +101,6 @@ def decode(
     background = np.ones(len(clip))
     events: list[Event] = []
     held: list[Withheld] = []
-    verified = rate is None and model.num_known > 1
-    odds: list[Array] = []
     for one in stretches:
         values, calm, absent = segment_values(model, one, durations, wholes, stream.length, options)
         segments, _ = best_tiling(one.lattice.windows, values, calm)
@@ -115,7 +112,6 @@ def decode(
         background[first:end] = 1.0 - inside.sum(axis=1).clip(0.0, 1.0)[cell]
         mine = _merge_segments(model, one, segments, durations, stream.length)
         events += events_of(model, one, mine, values, classes, stream.length)
-        odds += [odds_of(model, one, mine, calm, stream.length)] * verified
         # what would be there, did rest and absence count as movement, and is not
         awake = np.minimum(calm, options.min_quality * _unit(one, durations))
         restless, _ = best_tiling(one.lattice.windows, values + absent, awake)
@@ -127,10 +123,7 @@ def decode(
         reasons: list[Reason] = ["nobody there" if not one.present[part.first : part.last].any() else "at rest" for part in silent]
         silent_events = events_of(model, one, silent, values, classes, stream.length)
         held += [Withheld(event, reason) for event, reason in zip(silent_events, reasons, strict=True)]
-    if verified:
-        events, low = _select_verified(events, np.concatenate([*odds, np.zeros(0)]))
-    else:
-        events, low = _apply_level(model, events, None if model.hidden else rate)
+    events, low = _apply_level(model, events, rate)
     if progress is not None:
         progress(1.0)
     held = sorted([*held, *low], key=lambda each: each.event.start)
@@ -285,28 +278,6 @@ def events_of(
         start, end = one.lattice.edges[part.first], one.lattice.edges[part.last]
         events.append(Event(classes[part.label], float(start), float(end), score, margin, exemplar))
     return events
-
-
-def odds_of(model: ShapeModel, one: Stretch, parts: Sequence[TiledSegment], calm: Array, length: int) -> Array:
-    """``(parts,)`` log odds that segments are the actions that they are told as; those of background are."""
-    out = np.full(len(parts), np.inf)
-    known = [i for i, part in enumerate(parts) if part.label < model.num_known]
-    if known:
-        mine = [parts[i] for i in known]
-        windows = one.resample(np.array([part.window for part in mine]), length).to(model.labels.device)
-        gain = np.array([part.value - calm[part.first : part.last].sum() for part in mine])
-        motion = np.array([one.motion[part.first : part.last].mean() for part in mine])
-        out[known] = log_odds(figures_of(model, windows, [part.label for part in mine], gain, motion))
-    return out
-
-
-def _select_verified(events: list[Event], odds: Array) -> tuple[list[Event], list[Withheld]]:
-    """Those events that are rather right than other movement, and those that are not."""
-    known = np.isfinite(odds)
-    good = ~known
-    good[known] = adapt(odds[known]) > 0
-    pairs = list(zip(events, good, strict=True))
-    return [event for event, fine in pairs if fine], [Withheld(event, "other movement") for event, fine in pairs if not fine]
 
 
 def _apply_level(model: ShapeModel, events: list[Event], rate: float | None) -> tuple[list[Event], list[Withheld]]:

@@ -8,7 +8,6 @@ are the frames and the windows of that time, whatever the length of the stream.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, Self
@@ -33,12 +32,10 @@ from indexing.recordings.decoding import (
     best_tiling,
     events_of,
     log_scores,
-    odds_of,
     posterior,
     segment_values,
 )
 from indexing.recordings.evidence import DURATION_REACH, MAX_TEMPO_FACTOR, MIN_CYCLIC, Durations, Lattice
-from indexing.recordings.verification import adapt
 from indexing.scoring import Event, event_levels
 from indexing.skeleton import Skeleton
 from indexing.windows import Ragged, concatenate_clips, repair_clip
@@ -47,7 +44,6 @@ from indexing.windows import Ragged, concatenate_clips, repair_clip
 BLOCK_SECONDS = 0.5  # of frames that a stream looks at together: a part of its lag, and the fewer the more it costs
 MEMORY_SECONDS = 300.0  # of the past by which a stream scales its scores: less where cameras and people change
 HORIZON = 1.25
-MAX_PAST_EVENTS = 500  # that tell what share of a stream's events is right
 NUM_RECENT_STEPS = 30  # between the latest frames, which may be too far apart for any window
 
 Array = NDArray[Any]
@@ -100,40 +96,32 @@ class _Cells:
 
 @dataclass(frozen=True)
 class _Tiled:
-    """Cells explained: what windows ``(W, classes)`` and background ``(cells,)`` are worth, the segments by the edge where they
-    begin, posterior of cells."""
+    """Cells explained: what windows are worth ``(W, classes)``, the segments by the edge where they begin, posterior of cells."""
 
     one: Stretch
     values: Array
-    calm: Array
     segments: dict[int, TiledSegment]
     likely: Array
 
 
 @dataclass(frozen=True)
 class _Running:
-    """An event that may go on: its class (number), seconds of the longest of its segments, log odds of the surest one."""
+    """An event that may go on: its class (number), and seconds of the longest of its segments."""
 
     event: Event
     label: int
     longest: float
-    odds: float
 
     @classmethod
-    def after(cls, before: Self | None, part: TiledSegment, event: Event, odds: float) -> Self:
+    def after(cls, before: Self | None, part: TiledSegment, event: Event) -> Self:
         """A segment, and those before it that it goes on from."""
         seconds = event.end - event.start
         if before is None:
-            return cls(event, part.label, seconds, odds)
+            return cls(event, part.label, seconds)
         past = before.event
         score = float(np.average([past.score, event.score], weights=[past.end - past.start, seconds]))
         longer = event if seconds > before.longest else past
-        return cls(
-            replace(longer, start=past.start, end=event.end, score=score),
-            part.label,
-            max(seconds, before.longest),
-            max(odds, before.odds),
-        )
+        return cls(replace(longer, start=past.start, end=event.end, score=score), part.label, max(seconds, before.longest))
 
 
 class RunningLevel:
@@ -172,7 +160,6 @@ class ActionStream:
         self._horizon, self.lag = self._horizon_of(lag)
         self._place = _places(source, up, skeleton)
         self._floor = _floor(model, source.rate)
-        self._verified, self._past = source.rate is None and model.num_known > 1, deque[float](maxlen=MAX_PAST_EVENTS)
         cells = MEMORY_SECONDS / self._step
         self._contrast = RunningLevel(cells * model.classes)
         self._wholes = RunningLevel(cells * model.classes * len(self._lengths))
@@ -346,18 +333,18 @@ class ActionStream:
         whole = cells.whole[row, which]
         one = Stretch(self._source(frames), lattice, cells.raw, cells.raw / spread, cells.motion, cells.present, whole, (0, frames))
         if not len(row):
-            return _Tiled(one, np.zeros((0, model.classes)), np.zeros(count), {}, np.zeros((count, model.classes)))
+            return _Tiled(one, np.zeros((0, model.classes)), {}, np.zeros((count, model.classes)))
         values, calm, _ = segment_values(model, one, self._durations, self._wholes.level(), self._look.length, self._look.options)
         segments, _ = best_tiling(lattice.windows, values, calm)
         likely = posterior(lattice.windows, values, calm, TEMPERATURE)
-        return _Tiled(one, values, calm, {each.first: each for each in segments}, likely)
+        return _Tiled(one, values, {each.first: each for each in segments}, likely)
 
     def _answer_remaining(self) -> list[LiveAnswer]:
         """All that is left, as if nothing followed."""
         if len(self._cells):
             return [self._select_decided(self._decode(len(self._at)), None)[0]]
         silent = self._unknown_scores(slice(self._told, None))
-        return [silent if self._running is None else replace(silent, events=self._select_reported([self._running]))]
+        return [silent if self._running is None else replace(silent, events=self._select_reported([self._running.event]))]
 
     def _decide(self, frames: int, count: int) -> list[LiveAnswer]:
         """Decide what begins in the first ``count`` cells, tell it, and forget what nothing needs any more."""
@@ -373,19 +360,19 @@ class ActionStream:
     def _select_decided(self, tiled: _Tiled, count: int | None) -> tuple[LiveAnswer, int, _Running | None]:
         """What begins in the first ``count`` cells, the edge that it reaches to, and the event that may go on there."""
         known, edge, running = len(self.classes), 0, self._running
-        done: list[_Running] = []
+        done: list[Event] = []
         while edge < (len(self._cells) if count is None else count):
             part = tiled.segments.get(edge)
             edge = edge + 1 if part is None else part.last
             mine = None if part is None or part.label >= known or not self._has_evidence(tiled, part) else part
             goes_on = mine is not None and running is not None and running.label == mine.label
             if running is not None and not (goes_on and self._durations.cyclic[running.label] > MIN_CYCLIC):
-                done.append(running)
+                done.append(running.event)
                 running = None
             if mine is not None:
-                running = _Running.after(running, mine, self._event(tiled, mine), self._odds(tiled, mine))
+                running = _Running.after(running, mine, self._event(tiled, mine))
         if count is None and running is not None:
-            done.append(running)
+            done.append(running.event)
             running = None
         edges = tiled.one.lattice.edges
         last = len(self._at) if count is None else int(np.searchsorted(self._at, edges[edge] - EDGE_TOLERANCE))
@@ -408,19 +395,9 @@ class ActionStream:
         last = float(self._at[-1])
         return replace(event, start=min(event.start, last) + self._begin, end=min(event.end, last) + self._begin)
 
-    def _odds(self, tiled: _Tiled, part: TiledSegment) -> float:
-        """Log odds that a segment is the action that it is told as, where that is asked."""
-        if not self._verified:
-            return 0.0
-        return float(odds_of(self.source.model, tiled.one, [part], tiled.calm, self._look.length)[0])
-
-    def _select_reported(self, done: list[_Running]) -> list[Event]:
-        """Those that reach the level that was asked for, or are rather right than other movement by what was decided so far."""
-        good = [one.event.score >= self._floor for one in done]
-        if self._verified and done:
-            self._past.extend(one.odds for one in done)
-            good = (adapt(np.array(self._past))[-len(done) :] > 0).tolist()
-        return [one.event for one, fine in zip(done, good, strict=True) if fine]
+    def _select_reported(self, events: list[Event]) -> list[Event]:
+        """Those that reach the level that was asked for."""
+        return [event for event in events if event.score >= self._floor]
 
     def _unknown_scores(self, rows: slice) -> LiveAnswer:
         """Frames of which nothing can be said."""

@@ -376,7 +376,7 @@ MEANING = {
     "at rest": "it looks like the action, but the person hardly moves, compared with calm moments of the action",
     "nobody there": "the person is not in view for most of it",
     "below the level": "weaker than the level that was asked for (reject)",
-    "other movement": "there is movement, but it resembles the action hardly more than ordinary movement does",
+    "other movement": "there is movement, but it resembles the action no more than ordinary movement does",
 }
 """What the reasons mean for which something is not reported."""
 
