@@ -16,18 +16,18 @@ PACKAGES = ("dyntorch", "indexing")
 MAX_FIELDS = 12
 """Fields of the options of one verb."""
 BOUNDS = {
-    "files": 350,
-    "lines": 94_815,
-    "code lines": 58_748,
-    "docstring lines": 14_464,
+    "files": 352,
+    "lines": 94_908,
+    "code lines": 58_779,
+    "docstring lines": 14_477,
     "option fields": 111,
     "option fields that nobody sets": 0,
     "functions called by an everyday word": 2,
     "imports of our own inside functions": 29,
     "circles of imports": 0,
     "circles of imports, those for types too": 0,
-    "lines of experiments": 19_096,
-    "lines of tests": 54_567,
+    "lines of experiments": 19_372,
+    "lines of tests": 54_602,
 }
 """What each figure may be at most."""
 

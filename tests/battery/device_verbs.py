@@ -509,7 +509,7 @@ NOT_VERBS = {
     *("native_correlations", "native_deviations", "native_residuals"),
     # names, numbers and what results say
     *("Message", "Notice", "BodyModel", "LineStatus", "Status", "Motion", "MotionName", "MOTION_MODELS", "Polynomial", "Fourier"),
-    *("NoticeCode", "Invariant", "MovingShapes", "Recovery", "Outcome"),
+    *("NoticeCode", "Invariant", "MovingShapes", "Recovery", "Outcome", "DecisionModel"),
     *(name for name in PUBLIC if name.endswith("Options")),
     # results, and invariants: tests/battery/on_input.py takes each of them to a device
     *(name for name, value in PUBLIC.items() if isinstance(value, type) and issubclass(value, dyn.core.Outcome | dyn.Invariant)),

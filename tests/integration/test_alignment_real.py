@@ -28,7 +28,8 @@ def scored(name: str, triple: int) -> tuple:
 @pytest.mark.parametrize("name", ["cars2B", "cars3", "cars7"])
 def test_cars_move_and_roads_do_not(name: str) -> None:
     sequence, one = scored(name, 1)
-    assert one.result.status == dyn.Status.OK
+    # cars that drive alike are as good a background as the road: which of both stands still, nothing tells
+    assert one.result.status == (dyn.Status.AMBIGUOUS if name == "cars3" else dyn.Status.OK)
     assert one.accuracy > 0.95
     assert one.share(STATIC, ~sequence.background) == 0
     assert one.share(MOVING, ~sequence.background) > 0.9
