@@ -27,7 +27,7 @@ BOUNDS = {
     "circles of imports": 0,
     "circles of imports, those for types too": 0,
     "lines of experiments": 19_372,
-    "lines of tests": 54_602,
+    "lines of tests": 54_604,
 }
 """What each figure may be at most."""
 

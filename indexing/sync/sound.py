@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from dyntorch import Shift, Status
 from dyntorch.core import Notice, NoticeCode, status_from
-from dyntorch.numerics.logistic import DecisionModel
+from dyntorch.numerics import DecisionModel
 from indexing.sync.recordings import undecided_shift
 from indexing.sync.soundtrack import HOP_SECONDS, STEP_SECONDS, Sound, block_means
 

@@ -470,7 +470,7 @@ WAITS = {
     "refine": 32,
     "constrain": 32,
     "align_planar": 120,
-    "align_points": 150,
+    "align_points": 250,
     "align_lines": 60,
     "translating_planes": 150,
     "bundle_adjust": 50,
