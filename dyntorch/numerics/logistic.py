@@ -52,5 +52,5 @@ class DecisionModel:
 
     def against(self, figures: Mapping[str, float]) -> list[str]:
         """Names of the figures that lower the odds, against those of right answers, the most harmful one first."""
-        harm = {name: w * (figures[name] - usual) for name, w, usual in zip(self.names, self.coefficients, self.usual, strict=True)}
-        return [name for name in sorted(harm, key=harm.__getitem__) if harm[name] < 0]
+        harm = [w * (value - usual) for value, w, usual in zip(self._within(figures), self.coefficients, self.usual, strict=True)]
+        return [name for lost, name in sorted(zip(harm, self.names, strict=True)) if lost < 0]

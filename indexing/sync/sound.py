@@ -106,14 +106,14 @@ def sound_shift(
     the microphones, room included; how much nearer the source is to one of them, and how late the sound of a file is, no sound
     tells: a note says so, and :func:`check_by_sound` adds it.
     """
+    if not 0 < risk < 1:
+        raise ValueError(f"risk must lie between 0 and 1, got {risk!r}")
     missing = [which for which, one in zip("ab", (a, b), strict=True) if one is None]
     if a is None or b is None:
         return undecided_shift(fps, "sound", *(Notice(SoundNotice.NONE, 0.0, {"which": which}) for which in missing))
     dead = [Notice(SoundNotice.SILENT, 0.0, {"which": which}) for which, one in zip("ab", (a, b), strict=True) if one.silent]
     if dead:
         return undecided_shift(fps, "sound", *dead)
-    if not 0 < risk < 1:
-        raise ValueError(f"risk must lie between 0 and 1, got {risk!r}")
     search = SoundSearch(a, b, max_shift, 0.0 if rate is None else rate - 1, rate is None)
     if not search.lags.size:
         return undecided_shift(fps, "sound", Notice(SoundNotice.SHORT, MIN_OVERLAP_SECONDS))

@@ -1,7 +1,5 @@
 """How sure answers are."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

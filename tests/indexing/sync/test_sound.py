@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from indexing.sync.sound import check_by_sound, offset_difference, sound_shift
+from indexing.sync.sound import check_by_sound, decision_model, offset_difference, sound_shift
 from indexing.sync.soundtrack import Sound
 from tests.indexing.sync.footage import RATE, clicks, microphone, noises
 from tests.indexing.sync.scene import shift, told
@@ -26,6 +26,7 @@ def scene() -> np.ndarray:
 
 
 # ---- what is found -------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_two_microphones_agree_to_a_millisecond(scene):
     first, second = heard(scene, STARTS[0], 18.0), heard(scene, STARTS[1], 18.0, seed=1)
     found = sound_shift(first, second)
@@ -82,6 +83,8 @@ def test_unrelated_sounds_are_refused():
     sounds = [heard(noises(12.0, 10 + seed), 0.0, 10.0, seed) for seed in range(6)]
     found = [sound_shift(a, b) for i, a in enumerate(sounds) for b in sounds[:i]]
     assert not any(one.ok for one in found) and all("no shift of the sound stands out" in one.reason for one in found)
+    model = decision_model()  # a figure counts within the range that it was learned in
+    assert model.against(dict(zip(model.names, model.usual, strict=True)) | {"dynamics": 1e9, "coherence": -5.0})[0] == "coherence"
 
 
 @pytest.mark.slow
